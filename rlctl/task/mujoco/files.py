@@ -37,12 +37,18 @@ class ModelFile:
 
 
 def read_model_file(
-    path: Path, *, fixed: bool = False, inertia: Literal["file", "shape"] = "file", visuals: bool = True
+    path: Path,
+    *,
+    fixed: bool = False,
+    inertia: Literal["file", "shape"] = "file",
+    visuals: bool = True,
+    hulls: bool = True,
 ) -> ModelFile:
     """Read a URDF or MJCF file; raises `TaskError` with MuJoCo's message for one that it refuses.
 
     With `visuals` the geoms include the visual shapes of a URDF, in group 1; its collision shapes are in group 0.
-    Without it those of an MJCF file are left out, too, as far as nothing refers to them.
+    Without it those of an MJCF file are left out, too, as far as nothing refers to them. `hulls=False` keeps the meshes
+    with which shapes collide as the files have them.
     """
     if path.suffix not in (".urdf", ".xml"):
         first = f"; first: xacro {path.name} > {path.name.split('.')[0]}.urdf" if path.suffix == ".xacro" else ""
@@ -52,18 +58,19 @@ def read_model_file(
         described = _describe_mjcf(path, _prepare_mjcf(spec))
         if not visuals:
             _delete_visuals(spec)
-        _call_reader(path, lambda: use_hulls(spec, _list_mesh_files(path, spec)))
+        if hulls:
+            _call_reader(path, lambda: use_hulls(spec, _list_mesh_files(path, spec)))
         return described
     urdf = read_urdf(path, fixed=fixed, inertia_from_file=inertia == "file")
     if urdf.root is None:
         raise TaskError(f"MuJoCo cannot load {path}: {urdf.problem}")
     urdf.check_meshes()
-    spec = _call_reader(path, lambda: _parse_urdf(urdf, visuals=visuals))
+    spec = _call_reader(path, lambda: _parse_urdf(urdf, visuals=visuals, hulls=hulls))
     if visuals and any(geom.meshname for geom in spec.geoms if not is_colliding(geom)):
         try:
             spec.copy().compile()
         except ValueError:  # because of a visual mesh, or it will fail again
-            spec = _call_reader(path, lambda: _parse_urdf(urdf, visuals=False))
+            spec = _call_reader(path, lambda: _parse_urdf(urdf, visuals=False, hulls=hulls))
     if inertia == "shape":
         _call_reader(path, lambda: _take_inertia_of_shapes(spec))
     return _describe_urdf(path, spec, urdf.root, inertia == "file")
@@ -105,7 +112,7 @@ def _list_mesh_files(path: Path, spec: Any) -> dict[str, Path]:
     return {mesh.name: path.parent / spec.meshdir / mesh.file for mesh in spec.meshes if mesh.file}
 
 
-def _parse_urdf(urdf: Urdf, *, visuals: bool) -> Any:
+def _parse_urdf(urdf: Urdf, *, visuals: bool, hulls: bool) -> Any:
     """Return the `MjSpec` of a URDF; a mesh that MuJoCo does not read is converted, or left out if it is visual."""
     mujoco, root = import_mujoco(), ElementTree.fromstring(urdf.text)
     assets: dict[str, bytes] = {}
@@ -134,7 +141,8 @@ def _parse_urdf(urdf: Urdf, *, visuals: bool) -> Any:
         raise
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-    use_hulls(spec, {mesh.name: converted_from.get(mesh.file, Path(mesh.file)) for mesh in spec.meshes})
+    if hulls:
+        use_hulls(spec, {mesh.name: converted_from.get(mesh.file, Path(mesh.file)) for mesh in spec.meshes})
     colliding = {geom.meshname for geom in spec.geoms if is_colliding(geom)}
     for mesh in [mesh for mesh in spec.meshes if mesh.name not in colliding]:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # what is only drawn may be flat
