@@ -184,12 +184,24 @@ def new_task(
     walk: Annotated[
         bool, Option("--model has legs and is free: a task in which it follows velocity commands.", ("--walk",))
     ] = False,
+    pick: Annotated[
+        bool, Option("--model is an arm with a gripper: a task in which it lifts a block to a goal.", ("--pick",))
+    ] = False,
+    place: Annotated[bool, Option("As --pick: it puts the block down at a goal.", ("--place",))] = False,
+    push: Annotated[bool, Option("As --pick: it pushes the block to a goal.", ("--push",))] = False,
+    gripper: Annotated[
+        str | None, Option("Joint of the gripper of --pick, --place or --push, if it is not found.", metavar="JOINT")
+    ] = None,
+    tip: Annotated[
+        str | None, Option("Link of --model whose origin is between the fingers, if it is not found.", metavar="FRAME")
+    ] = None,
     json: Json = None,
 ) -> None:
-    """Create a starter plugin in a folder NAME: a reach or walk task that trains as it is, its recipe and tests."""
+    """Create a starter plugin in a folder NAME: a reach, walk or pick task that trains as it is, its recipe, tests."""
     from rlctl.tasks.new import create, show
 
-    show(create(name, model=model, link=link, walk=walk), json)
+    hand = [name for name, asked in (("pick", pick), ("place", place), ("push", push)) if asked]
+    show(create(name, model=model, link=link, walk=walk, hand=hand, gripper=gripper, tip=tip), json)
 
 
 @command

@@ -328,8 +328,8 @@ class _Description:
         across = _snap((apart - closed) / np.linalg.norm(apart - closed))
         turn, origin = self._linkage.frame(self._palm)
         axes = [self._linkage.axis(joint) for joint in self._linkage.list_beyond(self._closing.palm)]
-        anchor = (np.mean([point for point, _ in axes], axis=0) - origin) @ turn
-        outwards = middle - anchor
+        # From the wrist: where the file puts the axis of a joint that slides means nothing.
+        outwards = middle - (self._linkage.axis(self._closing.palm)[0] - origin) @ turn
         hinges = [axis @ turn for _, axis in axes if abs(axis @ turn @ across) < _ACROSS]
         if hinges and not all(map(self._linkage.slides, self._closing.drivers)):
             normal = np.cross(across, hinges[0])

@@ -5,6 +5,7 @@ import importlib.util
 import keyword
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from rlctl.environments import installed
@@ -41,22 +42,61 @@ class NewPlugin:
         return f"{self.folder / self.package / 'task.py'}:{self.cls}"
 
 
-def create(name: str, *, model: str | None = None, link: str | None = None, walk: bool = False) -> NewPlugin:
-    """Write the plugin `name` atomically into the current folder.
+@dataclasses.dataclass(frozen=True)
+class Robot:
+    """A user's own robot, and what it is to do."""
 
-    `model` is the user's own robot, of which `link` is to reach, or which is to `walk`. Raises `UsageError` for a name
-    in use, and for a model that is missing, or no arm or no robot with legs.
+    model: str | None = None
+    """A URDF or MJCF file; None for a planar arm."""
+    link: str | None = None
+    """The link that reaches."""
+    walk: bool = False
+    hand: tuple[str, ...] = ()
+    """Of pick, place and push those that were asked for."""
+    gripper: str | None = None
+    """A joint of the gripper of a hand."""
+    tip: str | None = None
+    """The link whose origin is between the fingers of a hand."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for options that exclude each other, or need another one."""
+        kinds = [*(["walk"] if self.walk else []), *self.hand]
+        if len(kinds) > 1:
+            raise UsageError(f"{' and '.join(f'--{kind}' for kind in kinds)} exclude each other: a task has one aim")
+        chosen = {"link": self.link, "gripper": self.gripper, "tip": self.tip}
+        given = [*kinds, *(name for name, value in chosen.items() if value is not None)]
+        if self.model is None and given:
+            raise UsageError(f"--{given[0]} needs --model")
+        if kinds and self.link is not None:
+            raise UsageError(f"--{kinds[0]} and --link exclude each other: --link is the tip of an arm that reaches")
+        for name in ("gripper", "tip"):
+            if chosen[name] is not None and not self.hand:
+                raise UsageError(f"--{name} needs --pick, --place or --push")
+
+
+def create(
+    name: str,
+    *,
+    model: str | None = None,
+    link: str | None = None,
+    walk: bool = False,
+    hand: Sequence[str] = (),
+    gripper: str | None = None,
+    tip: str | None = None,
+) -> NewPlugin:
+    """Write the plugin `name` atomically into the current folder, of a `Robot`, whose attributes the others are.
+
+    Raises `UsageError` for a name in use, for options that do not fit together, and for a model that is missing, or
+    cannot do what is asked.
     """
-    if model is None and (walk or link is not None):
-        raise UsageError(f"{'--walk' if walk else '--link'} needs --model")
-    if walk and link is not None:
-        raise UsageError("--walk and --link exclude each other: --link is the tip of an arm")
+    asked = Robot(model, link, walk, tuple(hand), gripper, tip)
+    asked.check()
     package = name.replace("-", "_").lower()
     _check(name, package)
     folder = Path(name)
     if os.path.lexists(folder):
         raise UsageError(f"{folder} already exists; choose another name or another folder")
-    robot = _read_robot(model, link, walk=walk)
+    robot = _read_robot(asked)
     sources = _read_templates(TEMPLATE) | (_read_templates(robot.template) if robot.template else {})
     cls = _make_class_name(name, "".join(sources.values()))
     model_in_readme = quote_code_of_markdown(f"{package}/{robot.values['model']}")
@@ -75,14 +115,18 @@ def create(name: str, *, model: str | None = None, link: str | None = None, walk
     return NewPlugin(name, folder, package, cls, sorted(content), robot.summary)
 
 
-def _read_robot(model: str | None, link: str | None, *, walk: bool) -> StarterRobot:
-    if model is None:
+def _read_robot(asked: Robot) -> StarterRobot:
+    if asked.model is None:
         return make_planar_arm()
-    if not walk:
-        return read_robot(model, link)
-    from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
+    if asked.walk:
+        from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
 
-    return read_legged_robot(model)
+        return read_legged_robot(asked.model)
+    if asked.hand:
+        from rlctl.tasks.hand_robot import read_hand_robot
+
+        return read_hand_robot(asked.model, asked.hand[0], gripper=asked.gripper, tip=asked.tip)
+    return read_robot(asked.model, asked.link)
 
 
 def _choose_lines(text: str, kept: frozenset[str]) -> str:
