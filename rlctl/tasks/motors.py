@@ -13,6 +13,7 @@ from rlctl.tasks.shapes import Array
 
 _FULL_FORCE = 0.1  # [rad or m], from the target at which a motor of the arm gives all its force
 _FULL_GRIP = 0.15  # of the gripper's way
+_CLOSING = 0.3  # [s], in which the gripper closes
 _SAG = 0.02  # [rad or m], by which the arm's own weight moves a joint from its target, at most
 _SLOWEST, _FASTEST = 15.0, 80.0  # [rad/s], of a joint's oscillation without damping
 _DAMPING = 0.8  # of the critical one
@@ -21,7 +22,7 @@ _STRENGTH = 3.0  # times the torque against gravity, of a motor without a limit 
 _ACCELERATION = 8.0  # [rad/s^2], that such a motor gives as well
 _ENDLESS = 40.0  # times what a motor needs: more is no limit
 _POSES = 60
-_GRIP = 20.0  # force on a held block by its weight
+_GRIP = 40.0  # force on a held block by its weight
 _GRAVITY = 9.81
 
 
@@ -64,6 +65,8 @@ def choose_motors(
     stiffness = np.minimum(stiffness, _FASTEST**2 * moved)
     stiffness[arm] = np.maximum(stiffness, _SLOWEST**2 * moved)[arm]
     damping = 2 * _DAMPING * np.sqrt(stiffness * moved)
+    for joint in driven:  # with its full force it closes fast enough
+        damping[joint] = min(damping[joint], forces[joint] * _CLOSING / way[joint])
     return Motors(stiffness, damping, armature, forces, notes)
 
 
