@@ -56,10 +56,13 @@ def choose_motors(
         wanted = force + friction[joint]
         forces[joint] = min(wanted, limits[joint]) if limits[joint] > 0 else wanted
     armature = np.where(own > 0, own, forces / _MOTOR)
-    armature[gripper.joints] = np.where(own > 0, own, 0.2 * armature)[gripper.joints]
+    way = np.abs(gripper.open - gripper.closed)
+    for joint in gripper.joints:
+        # A force that does not crush the block moves the motor of a gripper fast enough only if that is light.
+        quick = forces[joint] * _CLOSING**2 / (4 * way[joint]) if joint in driven else 0.0
+        armature[joint] = min(armature[joint], quick)
     moved = inertia - own + armature
     stiffness = np.maximum(forces / _FULL_FORCE, weight / _SAG)
-    way = np.abs(gripper.open - gripper.closed)
     for joint in driven:
         stiffness[joint] = forces[joint] / (_FULL_GRIP * way[joint])
     stiffness = np.minimum(stiffness, _FASTEST**2 * moved)
