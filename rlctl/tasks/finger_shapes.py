@@ -91,7 +91,9 @@ class _Probe:
         return nearest
 
 
-def fit_boxes(links: Sequence[str], linkage: Linkage, surfaces: Surfaces, gripper: Gripper) -> dict[str, list[FingerBox]]:
+def fit_boxes(
+    links: Sequence[str], linkage: Linkage, surfaces: Surfaces, gripper: Gripper
+) -> dict[str, list[FingerBox]]:
     """Return boxes around slices of links, across the direction of the fingers, while these hold a block.
 
     Slices are thin next to the block. What of a palm is on both sides of the block gets a box on each side.

@@ -21,10 +21,11 @@ _WIDEST_TURN = 1.1  # [rad], of a finger from closed to open
 _COARSE = 4  # every so many points and positions, for a first look
 _TOUCH = 2e-3  # [m], between points of surfaces that touch
 _REMAINS = 0.35  # of the opening: fingers that come no nearer do not close
+_OPEN = 0.5  # of the opening: where the gripper is open
 _LEAST_OPENING = 8e-3  # [m]
 _OUTER = 0.5  # of a jaw's length from its hinge: where it grips
 _TILT = 0.4  # [rad], of the finger's face against a block
-_SNAP = 0.17  # [rad], from an axis of the palm
+_SNAP = 0.3  # [rad], from an axis of the palm
 _PAD = 3e-3  # [m], of surfaces that are a contact when the gripper is closed
 _ACROSS = 0.5  # cosine: axes of hinges are across the direction in which fingers close
 _LEAST_DEPTH, _CLEARANCE = 4e-3, 2e-3  # [m], of the grip above the tips, of the tips above the table
@@ -79,7 +80,10 @@ class _Closing:
 
     @property
     def closes(self) -> bool:
-        return self.gaps.min() <= max(_TOUCH, _REMAINS * self.opening) and self.opening >= _LEAST_OPENING
+        is_closed = self.gaps.min() <= max(_TOUCH, _REMAINS * self.opening)
+        # A wrist that bends to both sides is no gripper.
+        is_open = self.gaps[0] >= _OPEN * self.opening
+        return bool(is_closed and is_open and self.opening >= _LEAST_OPENING)
 
 
 class GripperSearch:
@@ -147,6 +151,8 @@ class GripperSearch:
         fixed = linkage.list_links(palm)
         sets = [(one, other) for index, one in enumerate(groups) for other in groups[index + 1 :]]
         is_pair = bool(sets)
+        if not is_pair and len(drivers) > 1:  # an arm's own joints, which bend it
+            return None
         best: _Closing | None = None
         for ends in self._list_ends(drivers):
             path = self._make_path(beyond, drivers, ends)

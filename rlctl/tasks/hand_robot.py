@@ -200,9 +200,7 @@ def _write_block(hand: _Hand) -> bytes:
     sizes, mass = hand.block, hand.mass
     squares = sizes**2
     moments = mass / 12 * (squares.sum() - squares)
-    inertia = " ".join(
-        f'i{axis}{axis}="{moment:.3g}"' for axis, moment in zip("xyz", moments.tolist(), strict=True)
-    )
+    inertia = " ".join(f'i{axis}{axis}="{moment:.3g}"' for axis, moment in zip("xyz", moments.tolist(), strict=True))
     box = f'<geometry><box size="{" ".join(f"{size:g}" for size in sizes)}"/></geometry>'
     return f"""<?xml version="1.0"?>
 <robot name="block">
@@ -244,9 +242,13 @@ def _summarize(hand: _Hand, notes: Sequence[str]) -> str:
     if hand.position[2]:
         lines.append(f"Its base is {hand.position[2]:+.3g} m higher than in the file, so that it is on the table")
     if gripper.others:
-        lines.append(f"Other grippers keep START; for one of them: {', '.join(f'--gripper {name}' for name in gripper.others)}")
+        lines.append(
+            f"Other grippers keep START; for one of them: {', '.join(f'--gripper {name}' for name in gripper.others)}"
+        )
     lines += [*notes, *hand.motors.notes, *list_faults(hand.body)]
-    lines.append("--gripper and --tip choose another joint and point; comments with CHANGE in task.py mark what to adapt")
+    lines.append(
+        "--gripper and --tip choose another joint and point; comments with CHANGE in task.py mark what to adapt"
+    )
     return ".\n".join(lines)
 
 
@@ -292,7 +294,9 @@ def _describe(hand: _Hand) -> dict[str, str]:
         "max_force": write_list("MAX_FORCE = ", [write_number(value, ".3g") for value in forces]),
         "force_comment": ", of joints with motors" if passive else "",
         "max_speed": write_list("MAX_SPEED = ", map(write_number, speeds)),
-        "inclined": SourceText(f" {math.degrees(table.tilt):.0f} degrees inclined" if table.tilt > _INCLINED else " down"),
+        "inclined": SourceText(
+            f" {math.degrees(table.tilt):.0f} degrees inclined" if table.tilt > _INCLINED else " down"
+        ),
         "area_low": _write_array(area[0]),
         "area_high": _write_array(area[1]),
         "half": write_number(hand.block[2] / 2, ".4g"),

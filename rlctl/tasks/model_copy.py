@@ -90,7 +90,10 @@ def _copy_mjcf(model: Path, sources: dict[Path, str]) -> bytes:
 
     spec = mujoco.MjSpec.from_file(str(model))
     folders = {"mesh": spec.meshdir, "hfield": spec.meshdir, "skin": spec.meshdir, "texture": spec.texturedir}
-    root = ElementTree.fromstring(spec.to_xml())
+    try:
+        root = ElementTree.fromstring(spec.to_xml())
+    except ValueError as error:  # a mesh is missing
+        raise UsageError(f"--model: MuJoCo cannot load {model}: {' '.join(str(error).split())}") from None
     for asset in root.iterfind("asset/*[@file]"):
         name = asset.get("file", "")
         asset.set("name", asset.get("name", Path(name).stem))

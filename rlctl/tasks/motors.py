@@ -37,9 +37,7 @@ class Motors:
     notes: list[str]  # what a user should know, without a full stop
 
 
-def choose_motors(
-    linkage: Linkage, gripper: Gripper, driven: Sequence[int], start: Array, block_mass: float
-) -> Motors:
+def choose_motors(linkage: Linkage, gripper: Gripper, driven: Sequence[int], start: Array, block_mass: float) -> Motors:
     """Return motors with which an arm holds itself, and whose gripper presses with `_GRIP` times a block's weight."""
     body, model = linkage.body, linkage.model
     inertia = _measure_inertia(linkage, start)

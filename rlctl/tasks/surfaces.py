@@ -98,10 +98,13 @@ def _list_profile(is_capsule: bool, size: Array) -> list[tuple[float, float]]:
 def _turn(profile: list[tuple[float, float]]) -> Array:
     """Return the triangles of a profile that is turned about z."""
     turns = np.linspace(0, 2 * np.pi, _RING + 1)
-    rings = [np.stack([radius * np.cos(turns), radius * np.sin(turns), np.full(_RING + 1, height)], axis=1)
-             for radius, height in profile]
-    quads = [np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
-             for low, high in zip(rings, rings[1:], strict=False)]
+    rings = [
+        np.stack([radius * np.cos(turns), radius * np.sin(turns), np.full(_RING + 1, height)], axis=1)
+        for radius, height in profile
+    ]
+    quads = [
+        np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1) for low, high in zip(rings, rings[1:], strict=False)
+    ]
     return _split_quads(np.concatenate(quads))
 
 

@@ -111,6 +111,8 @@ class TableSearch:
             seed = self._rest.copy()
             seed[arm] = start[arm]
             seeds.append(seed)
+        if near is None and not any(self._approach(point, outwards, None, seed)[1] < _MISSED for seed in seeds[:3]):
+            return None  # too far away
         if near is not None:
             seeds = [near, *seeds[:3]]
         found = [pose for seed in seeds if (pose := self._solve(point, outwards, tilt, seed)) is not None]
@@ -134,9 +136,7 @@ class TableSearch:
         lowest = self._shapes.find_lowest(self._linkage.data) + self._height
         return pose if lowest > _LOWEST else None
 
-    def _approach(
-        self, point: Array, outwards: Array, tilt: float | None, seed: Array
-    ) -> tuple[Array, float, float]:
+    def _approach(self, point: Array, outwards: Array, tilt: float | None, seed: Array) -> tuple[Array, float, float]:
         """Move joints by damped least squares; return them, the distance left [m] and the angle left [rad]."""
         import mujoco
 
@@ -222,9 +222,7 @@ class TableSearch:
         goal_low = min(height + _GOAL[0] * self.reach, (height + highest) / 2)
         return Table(low, high, goal_low, highest, start, tilt, self.reach, outwards)
 
-    def _raise(
-        self, place: Array, height: float, to: float, outwards: Array, tilt: float | None, pose: Array
-    ) -> Array:
+    def _raise(self, place: Array, height: float, to: float, outwards: Array, tilt: float | None, pose: Array) -> Array:
         """Return the pose as high above a place as it gets, at most at `to`."""
         for level in np.linspace(height, to, 6)[1:]:
             found = self._solve(np.array([*place, level]), outwards, tilt, pose)
@@ -233,9 +231,7 @@ class TableSearch:
             pose = found
         return pose
 
-    def _find_highest(
-        self, centre: Array, corners: list[Array], height: float, outwards: Array, start: Array
-    ) -> float:
+    def _find_highest(self, centre: Array, corners: list[Array], height: float, outwards: Array, start: Array) -> float:
         """Return a height that the arm reaches above the whole area, the fingers pointing anywhere."""
         highest = height + _GOAL[1] * self.reach
         for _ in range(_TRIES):
