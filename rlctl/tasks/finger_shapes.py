@@ -6,6 +6,7 @@ MuJoCo collides with hulls: that of a jaw may fill the space between the fingers
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -115,7 +116,7 @@ def fit_boxes(
 
 
 def _slice(points: Array, gripper: Gripper) -> list[tuple[Array, Array]]:
-    """Return the lower and upper corners of boxes around points, in the gripper's frame from the middle of the block."""
+    """Return the lower and upper corners of boxes around points, in the gripper's frame from the block's middle."""
     if not len(points):
         return []
     lowest, tip, fine = float(points[:, 2].min()), float(points[:, 2].max()), gripper.height / 3
@@ -125,7 +126,7 @@ def _slice(points: Array, gripper: Gripper) -> list[tuple[Array, Array]]:
         edges.append(max(edges[-1] - fine, lowest))
     edges += np.linspace(edges[-1], lowest, 4)[1:].tolist() if edges[-1] > lowest + fine else []
     corners = []
-    for top, bottom in zip(edges, edges[1:], strict=False):
+    for top, bottom in itertools.pairwise(edges):
         layer = points[(points[:, 2] <= top + _OVERLAP) & (points[:, 2] >= bottom - _OVERLAP)]
         sides = [layer[layer[:, 0] > 0], layer[layer[:, 0] <= 0]] if top > above else [layer]
         for side in sides:

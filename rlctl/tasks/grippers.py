@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rlctl.errors import UsageError
@@ -229,8 +230,8 @@ class GripperSearch:
         for link, (turn, origin) in frames.items():
             way = clouds[link] @ turn.T + origin - anchor
             levers[link] = np.linalg.norm(np.cross(way, axis) if turns_alone else way, axis=1)
-        low, high = (choose(map(choose, levers.values())) for choose in (min, max))
-        least = low + _OUTER * (high - low)
+        every = np.concatenate(list(levers.values()))
+        least = every.min() + _OUTER * np.ptp(every)
         return {link: clouds[link][lever > least] for link, lever in levers.items() if (lever > least).any()}
 
     def _describe(self, closing: _Closing, others: list[str]) -> Gripper:
@@ -262,14 +263,15 @@ class _Description:
         turns = np.abs(path[:, turning] - closed[turning]).max(axis=1, initial=0.0)
         return int(np.flatnonzero(turns <= _WIDEST_TURN)[0])
 
-    def _find_pads(self) -> tuple[Array, Array]:
-        """Return which points of the fingers are next to the other finger when the gripper is closed."""
+    def _find_pads(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the indices of points of the fingers that are next to the other finger when the gripper is closed."""
         self._linkage.place(self._closing.path[self._last])
         first, second = (self._list_points(finger) for finger in (0, 1))
-        distances = cKDTree(second).query(first)[0]
+        distances = np.asarray(cKDTree(second).query(first)[0])
         near = float(distances.min()) + _PAD
-        pad = distances <= near
-        return pad, cKDTree(first[pad]).query(second)[0] <= near
+        pad = np.flatnonzero(distances <= near)
+        others = np.asarray(cKDTree(first[pad]).query(second)[0])
+        return pad, np.flatnonzero(others <= near)
 
     def describe(self, others: list[str]) -> Gripper:
         path, linkage = self._closing.path, self._linkage

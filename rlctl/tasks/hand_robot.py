@@ -81,8 +81,7 @@ def _choose_driven(linkage: Linkage, gripper: Gripper) -> list[int]:
     """Return the joints that motors move: all that follow by a fixed ratio, but none in a loop of links."""
     joints_only = int(linkage._mujoco.mjtEq.mjEQ_JOINT)
     if all(int(kind) == joints_only for kind in linkage.model.eq_type):
-        first = [*gripper.drivers, *(joint for joint in gripper.joints if joint not in gripper.drivers)]
-        return first
+        return [*gripper.drivers, *(joint for joint in gripper.joints if joint not in gripper.drivers)]
     return gripper.drivers
 
 
@@ -219,7 +218,8 @@ def _summarize(hand: _Hand, notes: Sequence[str]) -> str:
     """Return what was found, a sentence a line."""
     names, gripper, table = hand.body.joint_names, hand.gripper, hand.table
     area = table.high - table.low
-    fingers = " and ".join(repr(links[-1]) for links in gripper.fingers)
+    shaped = [[link for link in links if _has_shapes(hand.linkage, link)] for links in gripper.fingers]
+    fingers = " and ".join(repr(links[-1]) for links in shaped)
     fixed = ", which does not move," if gripper.has_fixed_finger else ""
     driver = gripper.drivers[0]
     lines = [

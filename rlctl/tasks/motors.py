@@ -1,4 +1,4 @@
-"""Motors of an arm and its gripper, from the limits and the inertias of a model: springs and dampers with a force limit."""
+"""Motors of an arm and its gripper from the limits and inertias of a model: springs and dampers with a force limit."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +103,7 @@ def _turn(profile: list[tuple[float, float]]) -> Array:
         np.stack([radius * np.cos(turns), radius * np.sin(turns), np.full(_RING + 1, height)], axis=1)
         for radius, height in profile
     ]
-    quads = [
-        np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1) for low, high in zip(rings, rings[1:], strict=False)
-    ]
+    quads = [np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1) for low, high in itertools.pairwise(rings)]
     return _split_quads(np.concatenate(quads))
 
 

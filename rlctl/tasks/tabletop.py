@@ -90,7 +90,9 @@ class TableSearch:
 
     def _try_radii(self, outwards: Array, tilt: float, height: float) -> list[tuple[float, Array]]:
         """Return the longest row of neighbouring distances from the base that are reached, and the poses there."""
-        rng, row, longest = np.random.default_rng(0), [], []
+        rng = np.random.default_rng(0)
+        row: list[tuple[float, Array]] = []
+        longest: list[tuple[float, Array]] = []
         for radius in np.linspace(0.2, 0.95, _RADII) * self.reach:
             point = np.array([*(self._base + radius * outwards), height])
             pose = self._search(point, outwards, tilt, rng, row[-1][1] if row else None)

@@ -153,7 +153,7 @@ def test_shapes_that_hold_are_kept(tmp_path):
     ],
 )
 def test_grippers_that_are_none(tmp_path, gripper, expected):
-    with pytest.raises(UsageError, match="arm.xml") as error:
+    with pytest.raises(UsageError, match=r"arm\.xml") as error:
         find(write_arm(tmp_path, gripper))
     assert expected in str(error.value)
 
@@ -161,7 +161,7 @@ def test_grippers_that_are_none(tmp_path, gripper, expected):
 def test_meshes_in_millimetres(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_parallel(tmp_path, more='<geom type="box" size="8 4 25" contype="0" conaffinity="0"/>')
-    with pytest.raises(UsageError, match="'left' is 53 m long.*millimetres.*0.001 0.001 0.001"):
+    with pytest.raises(UsageError, match=r"'left' is 53 m long.*millimetres.*0.001 0.001 0.001"):
         new.create("my-arm", model="arm.xml", hand=["pick"])
 
 
@@ -170,14 +170,14 @@ def test_a_model_in_millimetres(tmp_path, monkeypatch):
     file = write_parallel(tmp_path)
     text = file.read_text().replace('pos="0 0 0.25"', 'pos="0 0 250"')
     file.write_text(text)
-    with pytest.raises(UsageError, match="joints are 250 m apart.*millimetres; divide its lengths by 1000"):
+    with pytest.raises(UsageError, match=r"joints are 250 m apart.*millimetres; divide its lengths by 1000"):
         new.create("my-arm", model="arm.xml", hand=["pick"])
 
 
 def test_missing_meshes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_parallel(tmp_path, equality='<asset><mesh name="hand" file="hand.stl"/></asset>')
-    with pytest.raises(UsageError, match="hand.stl"):
+    with pytest.raises(UsageError, match=r"hand\.stl"):
         new.create("my-arm", model="arm.xml", hand=["pick"])
 
 
@@ -186,7 +186,7 @@ def test_an_arm_that_does_not_reach_the_table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = write_parallel(tmp_path)
     file.write_text(file.read_text().replace('range="-1.6 1.6"', 'range="-0.2 0.2"'))
-    with pytest.raises(UsageError, match="cannot reach the table, z = 0.*--tip FRAME"):
+    with pytest.raises(UsageError, match=r"cannot reach the table, z = 0.*--tip FRAME"):
         new.create("my-arm", model="arm.xml", hand=["pick"])
 
 
