@@ -307,6 +307,7 @@ def _describe(hand: _Hand) -> dict[str, str]:
         "lifted": write_number(0.08 * scale, ".2g"),
         "tolerance": write_number(hand.tolerance, "g"),
         "smaller": write_number(hand.tolerance / 2, "g"),
+        "nearest": write_number(max(2 * hand.tolerance, 0.12 * table.reach), ".2g"),
         "noise": write_number(0.1 * hand.tolerance, ".1g"),
         "fixed": _write_position(hand),
         "passive": SourceText(f"{{{join_source(write_string(names[joint]) for joint in passive)}}}")
