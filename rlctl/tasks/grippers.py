@@ -208,7 +208,8 @@ class GripperSearch:
                 world = points[::every] @ turn.T + origin
                 for other, tree in trees.items():
                     turn, origin = self._linkage.frame(other)
-                    gap = min(gap, float(tree.query((world - origin) @ turn, distance_upper_bound=gap)[0].min()))
+                    distances = tree.query((world - origin) @ turn, distance_upper_bound=gap)[0]
+                    gap = min(gap, float(np.min(distances)))
             gaps.append(gap)
         return np.array(gaps)
 

@@ -16,12 +16,12 @@ from rlctl.tasks.finger_shapes import find_unfit, fit_boxes, replace_shapes
 from rlctl.tasks.grippers import Gripper, GripperSearch
 from rlctl.tasks.linkage import Linkage
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
-from rlctl.tasks.motors import Motors, choose_motors
+from rlctl.tasks.motors import ChosenMotors, choose_motors
 from rlctl.tasks.shapes import Array, Shapes
 from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
 from rlctl.tasks.starter_robot import StarterRobot, list_faults, name_robot
 from rlctl.tasks.surfaces import Surfaces
-from rlctl.tasks.tabletop import Table, find_table
+from rlctl.tasks.tabletop import TableArea, find_table
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.body import MujocoBody
@@ -44,8 +44,8 @@ class _Hand:
     path: Path
     linkage: Linkage
     gripper: Gripper
-    table: Table
-    motors: Motors
+    table: TableArea
+    motors: ChosenMotors
     position: Array  # [m], of the base, from where the file has it
     boxed: dict[str, int]  # number of boxes by link
 

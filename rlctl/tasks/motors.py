@@ -27,7 +27,7 @@ _GRAVITY = 9.81
 
 
 @dataclasses.dataclass(frozen=True)
-class Motors:
+class ChosenMotors:
     """Values of all joints, shape (joints,)."""
 
     stiffness: Array  # [N m/rad or N/m]
@@ -37,7 +37,9 @@ class Motors:
     notes: list[str]  # what a user should know, without a full stop
 
 
-def choose_motors(linkage: Linkage, gripper: Gripper, driven: Sequence[int], start: Array, block_mass: float) -> Motors:
+def choose_motors(
+    linkage: Linkage, gripper: Gripper, driven: Sequence[int], start: Array, block_mass: float
+) -> ChosenMotors:
     """Return motors with which an arm holds itself, and whose gripper presses with `_GRIP` times a block's weight."""
     body, model = linkage.body, linkage.model
     inertia = _measure_inertia(linkage, start)
@@ -68,7 +70,7 @@ def choose_motors(linkage: Linkage, gripper: Gripper, driven: Sequence[int], sta
     damping = 2 * _DAMPING * np.sqrt(stiffness * moved)
     for joint in driven:  # with its full force it closes fast enough
         damping[joint] = min(damping[joint], forces[joint] * _CLOSING / way[joint])
-    return Motors(stiffness, damping, armature, forces, notes)
+    return ChosenMotors(stiffness, damping, armature, forces, notes)
 
 
 def _measure_inertia(linkage: Linkage, start: Array) -> Array:

@@ -29,7 +29,7 @@ _START, _GOAL = 0.15, (0.1, 0.35)  # of the reach: heights of the start and of g
 
 
 @dataclasses.dataclass(frozen=True)
-class Table:
+class TableArea:
     """Where an arm works on the floor, z = 0."""
 
     low: Array  # [m], x and y of the area's corner
@@ -71,7 +71,7 @@ class TableSearch:
         slides = sum(float(np.ptp(linkage.find_ends(joint))) for joint in gripper.arm if linkage.slides(joint))
         return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum()) + slides
 
-    def find(self) -> Table | None:
+    def find(self) -> TableArea | None:
         """Return the area, with the fingers as far down as possible; None if the arm does not reach the table."""
         height = self._gripper.height / 2
         for tilt in _TILTS:
@@ -182,7 +182,7 @@ class TableSearch:
 
     def _find_area(
         self, outwards: Array, tilt: float, height: float, reached: list[tuple[float, Array]]
-    ) -> Table | None:
+    ) -> TableArea | None:
         radii = [radius for radius, _ in reached]
         middle = (radii[0] + radii[-1]) / 2
         centre_pose = min(reached, key=lambda pair: abs(pair[0] - middle))[1]
@@ -217,12 +217,12 @@ class TableSearch:
 
     def _describe(
         self, centre: Array, corners: list[Array], height: float, outwards: Array, tilt: float, pose: Array
-    ) -> Table:
+    ) -> TableArea:
         start = self._raise(centre, height, height + _START * self.reach, outwards, tilt, pose)
         highest = self._find_highest(centre, corners, height, outwards, start)
         low, high = np.min(corners, axis=0), np.max(corners, axis=0)
         goal_low = min(height + _GOAL[0] * self.reach, (height + highest) / 2)
-        return Table(low, high, goal_low, highest, start, tilt, self.reach, outwards)
+        return TableArea(low, high, goal_low, highest, start, tilt, self.reach, outwards)
 
     def _raise(self, place: Array, height: float, to: float, outwards: Array, tilt: float | None, pose: Array) -> Array:
         """Return the pose as high above a place as it gets, at most at `to`."""
@@ -243,7 +243,7 @@ class TableSearch:
         return highest
 
 
-def find_table(linkage: Linkage, gripper: Gripper, height: float, hanging: float) -> tuple[Table, float]:
+def find_table(linkage: Linkage, gripper: Gripper, height: float, hanging: float) -> tuple[TableArea, float]:
     """Return the area on the table, and by how much the base is raised [m].
 
     `height` brings what is below the table onto it; `hanging` is how far the base is above the table otherwise, from
