@@ -43,7 +43,7 @@ class NewPlugin:
 
 
 @dataclasses.dataclass(frozen=True)
-class Robot:
+class AskedRobot:
     """A user's own robot, and what it is to do."""
 
     model: str | None = None
@@ -84,12 +84,12 @@ def create(
     gripper: str | None = None,
     tip: str | None = None,
 ) -> NewPlugin:
-    """Write the plugin `name` atomically into the current folder, of a `Robot`, whose attributes the others are.
+    """Write the plugin `name` atomically into the current folder, of a `AskedRobot`, whose attributes the others are.
 
     Raises `UsageError` for a name in use, for options that do not fit together, and for a model that is missing, or
     cannot do what is asked.
     """
-    asked = Robot(model, link, walk, tuple(hand), gripper, tip)
+    asked = AskedRobot(model, link, walk, tuple(hand), gripper, tip)
     asked.check()
     package = name.replace("-", "_").lower()
     _check(name, package)
@@ -115,7 +115,7 @@ def create(
     return NewPlugin(name, folder, package, cls, sorted(content), robot.summary)
 
 
-def _read_robot(asked: Robot) -> StarterRobot:
+def _read_robot(asked: AskedRobot) -> StarterRobot:
     if asked.model is None:
         return make_planar_arm()
     if asked.walk:
