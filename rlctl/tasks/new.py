@@ -84,7 +84,7 @@ def create(
     gripper: str | None = None,
     tip: str | None = None,
 ) -> NewPlugin:
-    """Write the plugin `name` atomically into the current folder, of a `AskedRobot`, whose attributes the others are.
+    """Write the plugin `name` atomically into the current folder, of an `AskedRobot`, whose attributes the others are.
 
     Raises `UsageError` for a name in use, for options that do not fit together, and for a model that is missing, or
     cannot do what is asked.

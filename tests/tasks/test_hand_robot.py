@@ -253,5 +253,5 @@ def test_it_waits_above_the_table_with_an_open_gripper(plugin):
 def test_a_plugins_own_tests_pass(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     write_parallel(tmp_path, equality=MIMIC)
-    new.create("my-arm", model="arm.xml", hand=[kind])
-    assert "5 passed" in run("pytest", "-q", "my-arm", cwd=tmp_path)
+    new.create(f"my-{kind}er", model="arm.xml", hand=[kind])
+    assert "5 passed" in run("pytest", "-q", f"my-{kind}er", cwd=tmp_path)
