@@ -1,0 +1,102 @@
+"""`pick` and `place`: a script that knows where everything is succeeds, and rewards pay each stage more than the last."""
+
+import numpy as np
+import pytest
+
+from rlctl.environments.spec import EnvSpec
+from rlctl.task.rotations import rotate
+from rlctl_manipulation.place import NEAREST, Place
+
+pytest.importorskip("mujoco")
+
+WORLDS = 4
+OPEN, CLOSED = 1.0, -1.0
+
+
+class Script:
+    """Worlds of a task, whose arms are moved to points by inverse kinematics, with the hand down."""
+
+    def __init__(self, task):
+        self.worlds = EnvSpec(task, {"start_noise": 0.0}).make_worlds(WORLDS)
+        self.worlds.reset(np.arange(WORLDS), list(range(WORLDS)))
+        self.task = self.worlds.calls.task
+
+    def find_joints(self, points):
+        """Return joint positions of shape (WORLDS, 7) at which the grasp frame is at `points` [m]."""
+        arm = self.task.arm
+        before, velocities = arm.joint_positions, arm.joint_velocities
+
+        def miss(joints):
+            arm.set_joints(np.column_stack([joints, before[:, 7:]]))
+            down = rotate(arm.link_orientation("grasp"), (0.0, 0.0, 1.0)) - (0.0, 0.0, -1.0)
+            return np.column_stack([arm.link_position("grasp") - points, 0.3 * down])
+
+        joints = before[:, :7]
+        for _ in range(12):
+            missed = miss(joints)
+            slopes = np.stack([(miss(joints + 1e-5 * step) - missed) / 1e-5 for step in np.eye(7)], axis=-1)
+            turned = slopes.swapaxes(-1, -2)
+            step = turned @ np.linalg.solve(slopes @ turned + 1e-4 * np.eye(6), missed[..., None])
+            joints = joints - step[..., 0]
+        arm.set_joints(before, velocities)
+        return joints
+
+    def go(self, points, fingers, steps):
+        """Move to `points` in `steps` control steps; return the last step."""
+        joints = self.find_joints(points)
+        for _ in range(steps):
+            action = np.clip((joints - self.task.target[:, :7]) / 0.05, -1.0, 1.0)
+            result = self.worlds.step(np.column_stack([action, np.full(WORLDS, fingers)]).astype(np.float32))
+        return result
+
+    def grasp(self):
+        """Close the fingers about the block."""
+        block = self.task.block.base_position
+        self.go(block + (0.0, 0.0, 0.1), OPEN, 20)
+        self.go(block, OPEN, 12)
+        return self.go(block, CLOSED, 15)
+
+
+@pytest.mark.parametrize("name", ["pick", "place"])
+def test_a_script_succeeds_and_each_stage_is_worth_more_than_the_last(name):
+    script, paid = Script(f"rlctl_manipulation.{name}:{name.title()}"), []
+    task = script.task
+
+    def note(result):
+        paid.append(np.median(result.reward))
+
+    note(script.go(task.block.base_position + (0.0, 0.0, 0.2), OPEN, 20))
+    note(script.grasp())
+    assert task.grasped.sum() >= WORLDS - 1
+    note(script.go(task.block.base_position + (0.0, 0.0, 0.1), CLOSED, 20))
+    script.go(task.goal + (0.0, 0.0, 0.08), CLOSED, 25)
+    note(script.go(task.goal, CLOSED, 20))
+    if name == "place":
+        assert not task.is_success().any()  # nothing is released yet
+        script.go(task.goal, OPEN, 4)
+        note(script.go(task.goal + (0.0, 0.0, 0.1), OPEN, 15))
+    assert task.is_success().sum() >= WORLDS - 1
+    assert paid == sorted(paid)
+    assert paid[-1] > 1.2  # of 1.5 in all
+    script.worlds.close()
+
+
+def test_a_block_in_the_hand_stays_there():
+    script = Script("rlctl_manipulation.pick:Pick")
+    script.worlds.level = 0.0
+    script.worlds.reset(np.arange(WORLDS), list(range(WORLDS)))
+    for _ in range(20):
+        script.worlds.step(np.tile(np.float32([0.0] * 7 + [CLOSED]), (WORLDS, 1)))
+    assert script.task.grasped.all()
+    assert (script.task.block.base_position[:, 2] > 0.15).all()  # [m]
+    script.worlds.close()
+
+
+def test_goals_are_away_from_the_block():
+    script = Script("rlctl_manipulation.place:Place")
+    for seed in range(20):
+        script.worlds.reset(np.arange(WORLDS), list(range(WORLDS * seed, WORLDS * seed + WORLDS)))
+        apart = np.linalg.norm(script.task.goal - script.task.block.base_position, axis=1)
+        assert (apart >= NEAREST).all()
+        assert (script.task.goal >= Place.goal_low).all() and (script.task.goal <= Place.goal_high).all()
+    script.worlds.close()
