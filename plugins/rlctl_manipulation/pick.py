@@ -99,22 +99,15 @@ class Pick(BatchTask):
         self.low, self.high = self.arm.joint_low[joints], self.arm.joint_high[joints]
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
-        """Start above the table with open fingers, the block somewhere on it.
-
-        At level 0.7 three in ten episodes begin with the block in the hand.
-        """
+        """Start above the table with open fingers, the block somewhere on it."""
         self.goal[worlds] = rng.uniform(self.goal_low, self.goal_high)
         joints = HOME + rng.uniform(-self.start_noise, self.start_noise, 7)
-        x, y, yaw, luck = rng.uniform([*BLOCK_LOW, -TURN, 0.0], [*BLOCK_HIGH, TURN, 1.0]).T
-        in_hand = luck >= self.level[worlds]
-        finger = np.where(in_hand, BLOCK[1], OPEN)
+        finger = np.full(len(worlds), OPEN)
+        self.target[worlds] = np.column_stack([joints, finger])
         self.arm.set_joints(np.column_stack([joints, finger, finger]), worlds=worlds)
-        self.target[worlds] = np.column_stack([joints, np.where(in_hand, 0.0, OPEN)])
-        in_hand = in_hand[:, None]
-        table = np.column_stack([x, y, np.full_like(x, BLOCK[2])])
-        place = np.where(in_hand, self.arm.link_position(GRASP)[worlds], table)
-        turn = np.where(in_hand, self.arm.link_orientation(GRASP)[worlds], from_axis((0, 0, 1), yaw))
-        self.block.set_base(place, turn, worlds=worlds)
+        x, y, yaw = rng.uniform([*BLOCK_LOW, -TURN], [*BLOCK_HIGH, TURN]).T
+        place = np.column_stack([x, y, np.full_like(x, BLOCK[2])])
+        self.block.set_base(place, from_axis((0, 0, 1), yaw), worlds=worlds)
 
     def act(self, action: np.ndarray) -> None:
         """Move the targets of the joints by a step."""
