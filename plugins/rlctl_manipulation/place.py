@@ -33,14 +33,22 @@ class Place(Pick):
         super().measure()
         x, y, height = (self.block_position - self.goal).T
         sideways = np.hypot(x, y)
-        # How high it has to be falls to 0 as it gets near.
-        self.lifted = np.clip((height + 0.001) / (np.minimum(sideways, LIFTED) + 0.001), 0.0, 1.0)
+        # How high it has to be carried falls to 0 where it may be set down.
+        clearance = np.clip(sideways - self.tolerance, 0.0, LIFTED)
+        self.lifted = np.clip((height + 0.001) / (clearance + 0.001), 0.0, 1.0)
         self.arrived = (sideways < self.tolerance) & (height < 0.01)
+        gap = self.arm.joint_positions[:, RIGHT:].min(axis=1) - BLOCK[1]  # [m]
+        self.released = np.clip(gap / FREE, 0.0, 1.0)
 
     def is_done(self) -> np.ndarray:
         """Return where the block rests at the goal, free of the fingers."""
-        free = self.arm.joint_positions[:, RIGHT:].min(axis=1) > BLOCK[1] + FREE
-        return self.arrived & free & (np.linalg.norm(self.block.base_velocity, axis=1) < RESTING)
+        resting = np.linalg.norm(self.block.base_velocity, axis=1) < RESTING
+        return self.arrived & (self.released == 1.0) & resting
+
+    def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the stages of `Pick`; half of `done` is for opening the fingers at the goal."""
+        terms = super().rewards(action)
+        return {**terms, "done": 0.5 * terms["done"] + 0.5 * self.arrived * self.released}
 
     def commands(self) -> dict[str, CommandTerm]:
         """Return the positions of the goals on the table."""
