@@ -46,9 +46,11 @@ class Place(Pick):
         return self.arrived & (self.released == 1.0) & resting
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the stages of `Pick`; half of `done` is for opening the fingers at the goal."""
+        """Return the stages of `Pick`; half of `carry` is for the last centimetres, half of `done` for open fingers."""
         terms = super().rewards(action)
-        return {**terms, "done": 0.5 * terms["done"] + 0.5 * self.arrived * self.released}
+        last = terms["lift"] * (1.0 - np.tanh(20.0 * self.distance))
+        opened = self.arrived * self.released
+        return {**terms, "carry": 0.5 * terms["carry"] + 0.5 * last, "done": 0.5 * terms["done"] + 0.5 * opened}
 
     def commands(self) -> dict[str, CommandTerm]:
         """Return the positions of the goals on the table."""
