@@ -23,7 +23,7 @@ from rlctl.output import format_count
 from rlctl.play.episode import load_episode
 from rlctl.policy.file import list_actor_tensors
 from rlctl.recipe.recipe import ON_POLICY
-from rlctl.storage import files
+from rlctl.storage import files, lerobot
 from rlctl.training.rollouts import Rollouts, to_network_layout
 from rlctl.training.snapshot import observation_statistics
 from rlctl.training.start import Start, describe_demonstrations
@@ -87,13 +87,14 @@ def _check(episode: Demonstration, env: EnvInfo) -> None:
 def _read(path: Path, task: str) -> list[Demonstration]:
     if own := [path] if path.suffix == ".npz" else sorted(path.glob("*.npz")):
         return [_read_own(file, task) for file in own]
-    is_lerobot = (path / "meta/info.json").is_file()
+    if lerobot.is_lerobot_dataset(path):
+        return _read_lerobot(path)
     minari_folder = path if (path / "metadata.json").is_file() else path / "data"
-    if not is_lerobot and not (minari_folder / "metadata.json").is_file():
+    if not (minari_folder / "metadata.json").is_file():
         kinds = "an episode (.npz), a folder of episodes, or the folder of a LeRobot or Minari dataset"
         raise ArtifactError(f"{path}: no demonstrations: give {kinds}")
     try:
-        return _read_lerobot(path) if is_lerobot else _read_minari(minari_folder)
+        return _read_minari(minari_folder)
     except ImportError as error:
         raise UsageError(explain_missing_package(f"--demos {path}", error.name, "demos")) from None
     except (OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError) as error:
@@ -125,23 +126,17 @@ def _read_minari(folder: Path) -> list[Demonstration]:
 
 
 def _read_lerobot(folder: Path) -> list[Demonstration]:
-    """Read the tables of format v3.0 (many episodes in a file) or v2.1 (one); images and videos are left out."""
-    features = files.read_json(folder / "meta/info.json")["features"]
+    """Read the columns that are observations, actions and success; images and videos are left out."""
+    features = lerobot.read_features(folder)
     observed = [
-        key for key in features if key.startswith("observation.") and features[key]["dtype"] not in ("image", "video")
+        name for name, feature in features.items() if name.startswith("observation.") and not feature.is_picture
     ]
     names = [*observed, "action", *({_SUCCESS} & set(features))]
-    import pyarrow
-    from pyarrow import parquet
-
-    index = ["episode_index", "frame_index"]
-    tables = [parquet.read_table(file, columns=[*names, *index]) for file in folder.glob("data/*/*.parquet")]
-    table = pyarrow.concat_tables(tables).sort_by([(name, "ascending") for name in index])
-    numbers, starts = np.unique(table["episode_index"].to_numpy(), return_index=True)
-    parts = {
-        name: np.split(np.array(table[name].to_pylist()).reshape(len(table), *features[name]["shape"]), starts[1:])
-        for name in names
-    }
+    if "action" not in features:
+        raise ArtifactError(f"{folder}: a dataset without `action`")
+    rows = lerobot.read_rows(folder, [features[name] for name in names], f"--demos {folder}")
+    numbers, starts = np.unique(rows[lerobot.EPISODE], return_index=True)
+    parts = {name: np.split(rows[name], starts[1:]) for name in names}
     keys = {name: SINGLE if name == _STATE else name.removeprefix("observation.") for name in observed}
     return [
         Demonstration(

@@ -6,19 +6,21 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError, check_name
 from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.storage import yaml_text
-from rlctl.storage.validation import Section
-from rlctl_robot.diagnose.signals import ACTIONS
+from rlctl.storage.validation import Number, Section
+from rlctl_robot.diagnose.signals import ACTIONS, Array
 
 _CLOSE = 0.72  # similarity of names, from 0 to 1
 _TIMES = ("time", "t", "timestamp", "stamp", "time_s")
-_EPISODES = ("episode", "segment", "trial")
+_EPISODES = ("episode", "segment", "trial", "episode_index")
 _PREFIXES = ("observation_", "observations_", "obs_")
 _SYNONYMS = {
-    "joint_positions": ("q", "qpos", "position", "positions", "joint_pos", "dof_pos", "joint_angles"),
+    "joint_positions": ("q", "qpos", "position", "positions", "joint_pos", "dof_pos", "joint_angles", "state"),
     "joint_velocities": ("dq", "qd", "qvel", "velocity", "velocities", "joint_vel", "dof_vel", "joint_speeds"),
     "angular_velocity": ("gyro", "gyroscope", "omega", "ang_vel", "base_ang_vel"),
     "gyroscope": ("gyro", "omega", "ang_vel", "base_ang_vel", "angular_velocity"),
@@ -43,6 +45,10 @@ class ColumnMap(Section):
     """Columns of each observation, in the policy's order of elements."""
     actions: list[str] = []
     """Columns of the action."""
+    scale: dict[str, Number | list[Number]] = {}
+    """Factor from the columns of an observation, or of `actions`, to the policy's unit; one, or one per element."""
+    offset: dict[str, Number | list[Number]] = {}
+    """Added after that, in the policy's unit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +61,21 @@ class ColumnAssignment:
     episode: str | None
     notes: tuple[str, ...]  # what was assigned other than by its exact name
     is_of_controller: bool = False  # whether the observations are the inputs of a controller
+    units: Mapping[str, tuple[Array, Array]] = dataclasses.field(default_factory=dict)
+    """Factor and offset from a column of an observation, or of `actions`, to the policy's unit, shape (n,) each."""
+
+    def stack(self, columns: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return observations and actions in the policy's units, a row per row of the columns."""
+        parts = {name: self._convert(name, names, columns) for name, names in self.observations.items()}
+        return np.column_stack(list(parts.values())), self._convert(ACTIONS, self.actions, columns)
+
+    def _convert(self, term: str, names: Sequence[str], columns: Mapping[str, Array]) -> Array:
+        values = np.column_stack([columns[name] for name in names])
+        if term not in self.units:
+            return values
+        scale, offset = self.units[term]
+        converted: Array = scale * values + offset
+        return converted
 
     @property
     def used(self) -> set[str]:
@@ -76,7 +97,9 @@ def assign_columns(path: Path, names: Sequence[str], info: EnvInfo, size: int, g
     finder = _Finder(path, names, info)
     inputs = {} if column_map.observations else _find_inputs(finder, info, size)
     found: dict[str, tuple[str, ...]] = {}
-    flat = finder.find_indexed(("observation", "observations", "obs"), size) if not column_map.observations else None
+    flat = None
+    if not column_map.observations:
+        flat = finder.find_indexed(("observation", "observations", "obs", "state"), size)
     if flat is not None:
         ends = iter(flat)
         found = {name: tuple(next(ends) for _ in range(count)) for name, count in terms.items()}
@@ -95,8 +118,25 @@ def assign_columns(path: Path, names: Sequence[str], info: EnvInfo, size: int, g
     for column in (column_map.time, column_map.episode):
         if column is not None:
             check_name(column, names, f"{given}: {path} has no column", ArtifactError)
+    units = _read_units(given, column_map, {name: len(columns) for name, columns in found.items()})
     chosen = found.pop(ACTIONS)
-    return ColumnAssignment(found, chosen, time, episode, tuple(finder.notes), bool(inputs) and flat is None)
+    is_of_controller = bool(inputs) and flat is None
+    return ColumnAssignment(found, chosen, time, episode, tuple(finder.notes), is_of_controller, units)
+
+
+def _read_units(given: Path | None, column_map: ColumnMap, sizes: Mapping[str, int]) -> dict[str, tuple[Array, Array]]:
+    units = {}
+    for name in {**column_map.scale, **column_map.offset}:
+        check_name(name, sizes, f"{given}: scale and offset are of observations and {ACTIONS}, not of", ArtifactError)
+        numbers = []
+        for key, values, default in (("scale", column_map.scale, 1.0), ("offset", column_map.offset, 0.0)):
+            number = np.asarray(values.get(name, default), np.float64)
+            if number.ndim and len(number) != sizes[name]:
+                raise ArtifactError(f"{given}: {key}: {name} has {sizes[name]} elements, and {len(number)} are given")
+            numbers.append(np.broadcast_to(number, sizes[name]))
+        scale, offset = numbers
+        units[name] = (scale, offset)
+    return units
 
 
 def _find_inputs(finder: "_Finder", info: EnvInfo, size: int) -> dict[str, tuple[str, ...]]:
@@ -177,7 +217,8 @@ class _Finder:
         joints = self._info.joints
         suffixes = [*_SUFFIXES.get(count, ())]
         if joints is not None and len(joints.names) == count:
-            suffixes.append(tuple(_simplify(joint) for joint in joints.names))
+            own = tuple(_simplify(joint) for joint in joints.names)
+            suffixes += [own, tuple(f"{joint}_pos" for joint in own)]  # LeRobot's names of joints
         for some in suffixes:
             if all(f"{text}_{suffix}" in self._by_text for suffix in some):
                 return tuple(self._by_text[f"{text}_{suffix}"] for suffix in some)

@@ -17,8 +17,9 @@ def diagnose(
     log: Annotated[
         Path | None,
         Argument(
-            "Observations and actions, a row per action: .csv or .npz with columns NAME_0, .., action_0, .., or what "
-            "`rlctl serve --rerun` wrote. Without it: an imported policy is played with changes of its mapping.",
+            "Observations and actions, a row per action: .csv or .npz with columns NAME_0, .., action_0, .., what "
+            "`rlctl serve --rerun` wrote, or the folder of a LeRobot dataset. Without it: an imported policy is played "
+            "with changes of its mapping.",
             metavar="[LOG]",
             default_text="",
         ),

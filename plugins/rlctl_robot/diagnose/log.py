@@ -10,7 +10,9 @@ from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError
 from rlctl.exporting.controller.observation import ControllerObservation
 from rlctl.exporting.controller.plan import ControllerPlan
+from rlctl.storage.lerobot import is_lerobot_dataset
 from rlctl_robot.diagnose.columns import ColumnAssignment, assign_columns
+from rlctl_robot.diagnose.dataset import read_dataset, read_dataset_header
 from rlctl_robot.diagnose.recording import read_recording
 from rlctl_robot.diagnose.signals import Array, LoggedSignals
 from rlctl_robot.diagnose.table import LogTable, TableHeader, read_header, read_table
@@ -42,18 +44,27 @@ class RobotLog:
 def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> RobotLog:
     """Read a log; raises `ArtifactError` that names the row and the column, and what to change."""
     shape = info.spaces()[0].shape or ()
+    is_dataset = is_lerobot_dataset(path)
     recording = read_recording(path) if path.suffix.lower() == ".rrd" else None
-    header = read_header(path) if recording is None else TableHeader(path, tuple(recording.columns))
+    if is_dataset:
+        header = read_dataset_header(path)
+    elif recording is not None:
+        header = TableHeader(path, tuple(recording.columns))
+    else:
+        header = read_header(path)
     size = int(np.prod(shape))
     assigned = assign_columns(path, header.names, info, size, columns)
-    table = recording or read_table(header, assigned.used)
+    if is_dataset:
+        table = read_dataset(path, assigned.used)
+    elif recording is not None:
+        table = recording
+    else:
+        table = read_table(header, assigned.used)
     if len(table.rows) < 2:
         count = f"{len(table.rows)} row{'' if len(table.rows) == 1 else 's'}"
         raise ArtifactError(f"{path}: {count} after the header; diagnose needs {_LEAST_ROWS} or more")
     lengths, notes = _split(table, assigned, info.control_dt)
-    names = [name for columns_of in assigned.observations.values() for name in columns_of]
-    observations = np.column_stack([table.columns[name] for name in names])
-    actions = np.column_stack([table.columns[name] for name in assigned.actions])
+    observations, actions = assigned.stack(table.columns)
     sizes = {name: len(some) for name, some in assigned.observations.items()}
     if assigned.is_of_controller:
         observations = _compute_observations(info, sizes, observations, actions, lengths)

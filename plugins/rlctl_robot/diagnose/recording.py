@@ -11,7 +11,7 @@ import numpy as np
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.storage import untrusted
 from rlctl_robot.diagnose.signals import Array
-from rlctl_robot.diagnose.table import LogTable
+from rlctl_robot.diagnose.table import LogTable, check_finite
 
 _ENTITY = re.compile(r"/client_(\d+)/(action|episode|limited|observation/.+)")
 _LIMITED = "limited"
@@ -43,10 +43,9 @@ def read_recording(path: Path) -> LogTable:
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     lengths = tuple(len(part["time"]) for part in parts)
     limited = columns.pop(_LIMITED, None)
-    for name, values in columns.items():
-        if (bad := np.flatnonzero(~np.isfinite(values))).size:
-            raise ArtifactError(f"{path}, row {bad[0]}, column {name}: {values[bad[0]]} is not a finite number")
-    return LogTable(path, columns, np.arange(sum(lengths)), lengths, "row", has_row_per_action=True, limited=limited)
+    rows = np.arange(sum(lengths))
+    check_finite(path, rows, columns)
+    return LogTable(path, columns, rows, lengths, "row", has_row_per_action=True, limited=limited)
 
 
 def _read_clients(path: Path) -> dict[int, dict[str, _Rows]]:

@@ -6,7 +6,7 @@ import io
 import itertools
 import math
 import zipfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -66,10 +66,12 @@ def read_header(path: Path) -> TableHeader:
         if twice := [name for name in names if names.count(name) > 1]:
             raise ArtifactError(f"{path}, line 1: column {twice[0]!r} is given twice")
     else:
-        raise ArtifactError(f"{path}: not a log that diagnose reads: give a .csv, .npz or .rrd file")
+        raise ArtifactError(
+            f"{path}: not a log that diagnose reads: give a .csv, .npz or .rrd file, or the folder of a LeRobot dataset"
+        )
     if not names:
         raise ArtifactError(f"{path}: it has no columns")
-    _check_width(path, len(names))
+    check_width(path, len(names))
     return TableHeader(path, tuple(names))
 
 
@@ -80,7 +82,8 @@ def read_table(header: TableHeader, used: Collection[str]) -> LogTable:
     return _read_csv(header, used)
 
 
-def _check_width(path: Path, columns: int) -> None:
+def check_width(path: Path, columns: int) -> None:
+    """Raise `ArtifactError` for a log with too many columns."""
     if columns > _MOST_COLUMNS:
         raise ArtifactError(f"{path}: {columns:,} columns, the limit is {_MOST_COLUMNS:,}")
 
@@ -192,7 +195,7 @@ def _read_members(path: Path, archive: zipfile.ZipFile) -> list[_Member]:
     members = []
     for name in archive.namelist():
         members.append(_read_member_header(path, archive, name))
-        _check_width(path, sum(member.width for member in members))
+        check_width(path, sum(member.width for member in members))
     return members
 
 
@@ -222,19 +225,25 @@ def _read_npz(path: Path, used: Collection[str]) -> LogTable:
         for one in members:
             if not count <= one.shape[0] <= count + 1:  # an episode has an observation more than actions
                 raise ArtifactError(f"{path}: {one.name} has {one.shape[0]:,} rows, another array {count:,}")
-        starts, length = _choose_rows(count)
+        starts, length = choose_windows(count)
         for one in members:
             part = _read_rows(path, archive, one, starts, length)
             columns |= {name: part[:, index] for index, name in enumerate(one.column_names()) if name in used}
     rows = (np.array(starts)[:, None] + np.arange(length)).ravel()
-    for name, values in columns.items():
-        if (bad := np.flatnonzero(~np.isfinite(values))).size:
-            raise ArtifactError(f"{path}, row {rows[bad[0]]}, column {name}: {values[bad[0]]} is not a finite number")
+    check_finite(path, rows, columns)
     note = f"{path}: {len(starts)} parts of {length} of {count:,} rows are read" if len(starts) > 1 else ""
     return LogTable(path, columns, rows, (length,) * len(starts), "row", note)
 
 
-def _choose_rows(count: int) -> tuple[Sequence[int], int]:
+def check_finite(path: Path, rows: Array, columns: Mapping[str, Array]) -> None:
+    """Raise `ArtifactError` for the first value of a column that is not finite; `rows` are its rows' numbers."""
+    for name, values in columns.items():
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise ArtifactError(f"{path}, row {rows[bad[0]]}, column {name}: {values[bad[0]]} is not a finite number")
+
+
+def choose_windows(count: int) -> tuple[Sequence[int], int]:
     """Return the first rows of the parts to read, and their length."""
     if count <= _WHOLE_ROWS:
         return [0], count
