@@ -23,7 +23,7 @@ MAPPING = {  # joint of the model: name at the robot, and rad = scale * robot's 
     "wrist_roll": ("wrist_roll.pos", DEGREE, 0.0),
     "gripper": ("gripper.pos", (1.75 - -0.17) / 100, -0.17),  # from 0, closed at -0.17 rad, to 100, open at 1.75 rad
 }
-PARTS = ["joint_positions", "joint_velocities", "joint_targets", "tip_to_goal", "goal"]  # what this program can observe
+PARTS = ["joint_positions", "joint_targets", "tip_to_goal", "goal"]  # what this program can observe
 START_SPEED = 0.5  # [rad/s], to the pose where the task's episodes begin
 MOST_LATE = 3  # control periods
 
@@ -179,15 +179,12 @@ def go_to_start(arm, server, clock):
 def play(arm, server, episode, goal, seconds, log, clock):
     """Let the policy bring the tip to a goal [m]; return how far away it is by the program's own kinematics [m]."""
     targets = go_to_start(arm, server, clock)
-    before, _ = arm.measure()
     ticks = Ticks(server.control_dt, clock)
     for step in range(round(seconds / server.control_dt)):
         measured_at = clock.perf_counter()
         positions, tip = arm.measure()
-        joints = [positions[joint] for joint in server.joints]
         observation = {
-            "joint_positions": joints,
-            "joint_velocities": [(positions[j] - before[j]) / server.control_dt for j in server.joints],
+            "joint_positions": [positions[joint] for joint in server.joints],
             "joint_targets": [targets[joint] for joint in server.joints],
             "tip_to_goal": goal - tip,
             "goal": goal,
@@ -196,8 +193,8 @@ def play(arm, server, episode, goal, seconds, log, clock):
         stepped = np.clip(observation["joint_targets"] + server.step * action, server.low, server.high)
         targets = arm.command(targets | dict(zip(server.joints, stepped, strict=True)))
         log.write(measured_at, episode, observation, action, state)
-        before = positions
         ticks.wait()
+    _, tip = arm.measure()
     return float(np.linalg.norm(goal - tip))
 
 

@@ -7,7 +7,7 @@ JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_ro
 NAMES = [f"{joint}.pos" for joint in JOINTS]
 START = dict.fromkeys(NAMES, 10.0)  # [deg], and percent of the gripper's opening
 TIME_CONSTANT = 0.03  # [s], in which a servo has 63 % of its way behind it
-TOP_SPEED = 180.0  # [deg/s]
+TOP_SPEED = 172.0  # [deg/s], the 3 rad/s of the task
 
 
 class StandIn:
