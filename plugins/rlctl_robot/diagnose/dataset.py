@@ -8,6 +8,7 @@ import numpy as np
 from rlctl.errors import ArtifactError
 from rlctl.storage import lerobot
 from rlctl.storage.lerobot import Feature
+from rlctl_robot.diagnose.signals import Array
 from rlctl_robot.diagnose.table import LogTable, TableHeader, check_finite, check_width, choose_windows
 
 _NUMBERS = ("float", "int", "uint", "bool")  # how the names of their types begin
@@ -25,12 +26,12 @@ def read_dataset_header(folder: Path) -> TableHeader:
 def read_dataset(folder: Path, used: Collection[str]) -> LogTable:
     """Read the `used` columns; raises `ArtifactError` for damaged tables and for what is not a finite number."""
     columns_of = {feature: _name_columns(folder, feature) for feature in _list_features(folder)}
-    wanted = [feature for feature, names in columns_of.items() if not used.isdisjoint(names)]
+    wanted = [feature for feature, names in columns_of.items() if any(name in used for name in names)]
     rows = lerobot.read_rows(folder, wanted, f"diagnose {folder}")
     count = len(rows[lerobot.EPISODE])
     starts, length = choose_windows(count)
     chosen = (np.array(starts)[:, None] + np.arange(length)).ravel()
-    columns = {}
+    columns: dict[str, Array] = {}
     for feature in wanted:
         values = rows[feature.name][chosen].reshape(len(chosen), -1).astype(np.float64)
         columns |= {name: values[:, index] for index, name in enumerate(columns_of[feature]) if name in used}
