@@ -239,6 +239,5 @@ def test_diagnose_finds_nothing_in_its_log_and_names_joints_that_are_exchanged(
     code, result = diagnose(("shoulder_lift.pos", "elbow_flex.pos"))
     assert code == 1
     first = result["findings"][0]["text"]
-    print(first)
     assert "elements 1 and 2" in first
     assert "are swapped" in first
