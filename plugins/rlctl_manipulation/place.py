@@ -28,15 +28,18 @@ class Place(Pick):
         near = rewards.distance(goal, self.block.base_position[worlds]) < NEAREST
         self.goal[worlds] = np.where(near[:, None], moved, goal)
 
+    reward_weights = {**Pick.reward_weights, "lower": 0.3, "release": 0.3}
+
     def measure(self) -> None:
         """Compute what rewards and success share, once per step."""
         super().measure()
         x, y, height = (self.block_position - self.goal).T
-        sideways = np.hypot(x, y)
+        self.distance, self.height = np.hypot(x, y), np.maximum(height, 0.0)  # [m], along the table and above it
+        self.above = self.distance < self.tolerance
         # How high it has to be carried falls to 0 where it may be set down.
-        clearance = np.clip(sideways - self.tolerance, 0.0, LIFTED)
-        self.lifted = np.clip((height + 0.001) / (clearance + 0.001), 0.0, 1.0)
-        self.arrived = (sideways < self.tolerance) & (height < 0.01)
+        clearance = np.clip(self.distance - self.tolerance, 0.0, LIFTED)
+        self.lifted = np.clip((self.height + 0.001) / (clearance + 0.001), 0.0, 1.0)
+        self.arrived = self.above & (self.height < 0.01)
         gap = self.arm.joint_positions[:, RIGHT:].min(axis=1) - BLOCK[1]  # [m]
         self.released = np.clip(gap / FREE, 0.0, 1.0)
 
@@ -46,11 +49,13 @@ class Place(Pick):
         return self.arrived & (self.released == 1.0) & resting
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the stages of `Pick`; half of `carry` is for the last centimetres, half of `done` for open fingers."""
-        terms = super().rewards(action)
-        last = terms["lift"] * (1.0 - np.tanh(20.0 * self.distance))
-        opened = self.arrived * self.released
-        return {**terms, "carry": 0.5 * terms["carry"] + 0.5 * last, "done": 0.5 * terms["done"] + 0.5 * opened}
+        """Return the stages of `Pick`, and between `carry` and `done` how low the block is and how open the fingers."""
+        lower = self.above & (self.grasped | self.arrived)
+        return {
+            **super().rewards(action),
+            "lower": lower * (1.0 - np.tanh(10.0 * self.height)),
+            "release": self.arrived * self.released,
+        }
 
     def commands(self) -> dict[str, CommandTerm]:
         """Return the positions of the goals on the table."""
