@@ -135,6 +135,7 @@ class Robustness(_Content):
     reward_weights: dict[str, float] = {}
     events: dict[str, dict[str, Any]] = {}  # events that are active in every cell; see `EnvSpec.events`
     randomize: bool = False  # whether all events of the task are active in every cell
+    own_settings: list[str] = []  # of the above, as `--set` names them, those that the policy file itself has
     sim: Engine = Engine()  # in which the cells were played; no choice: the policy's own
     other_task: str | None = None  # on which the policy was played; None: on that of its training
     policy_file: str  # or what `--policy` names: no file of rlctl, without algorithm and steps

@@ -9,14 +9,14 @@ import math
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rlctl import output
 from rlctl.engine import MUJOCO, Engine
 from rlctl.environments.registry import is_task
-from rlctl.environments.spec import EnvSpec
+from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.episode_statistics import summarize
@@ -90,6 +90,7 @@ def measure_robustness(
         reward_weights=dict(spec.reward_weights),
         events={name: dict(event) for name, event in spec.events.items()},
         randomize=spec.randomize,
+        own_settings=_find_own_settings(spec, policy, request),
         sim=_find_other_engine(spec, policy, request),
         other_task=request.task,
         policy_file=policy.name,
@@ -246,12 +247,9 @@ def check_gates(result: Robustness, gates: Gates) -> None:
 
 
 def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str:
-    """Return the command that plays the episodes of one cell."""
-    settings = {f"task.{name}": json.dumps(value) for name, value in result.parameters.items()}
-    settings |= {f"reward_weights.{name}": json.dumps(value) for name, value in result.reward_weights.items()}
-    for name, event in result.events.items():
-        values = {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()}
-        settings |= values or {f"events.{name}": "{}"}
+    """Return the command that plays the episodes of one cell; it leaves out what the policy file has itself."""
+    measured = _list_settings(result.parameters, result.reward_weights, result.events)
+    settings = {name: value for name, value in measured.items() if name not in result.own_settings}
     settings["randomize"] = json.dumps(result.randomize)
     engine = result.sim
     for axis, value in zip(varied.axes, cell.values, strict=True):
@@ -277,3 +275,25 @@ def format_command(result: Robustness, varied: RobustnessMap, cell: Cell) -> str
     if not result.deterministic:
         words.append("--stochastic")
     return shlex.join([*words, *(word for key, value in settings.items() for word in ("--set", f"{key}={value}"))])
+
+
+def _list_settings(
+    parameters: Mapping[str, Any], reward_weights: Mapping[str, float], events: Mapping[str, Mapping[str, Any]]
+) -> dict[str, str]:
+    """Return what `--set` takes for an environment, by name."""
+    settings = {f"task.{name}": json.dumps(value) for name, value in parameters.items()}
+    settings |= {f"reward_weights.{name}": json.dumps(value) for name, value in reward_weights.items()}
+    for name, event in events.items():
+        values = {f"events.{name}.{key}": json.dumps(value) for key, value in event.items()}
+        settings |= values or {f"events.{name}": "{}"}
+    return settings
+
+
+def _find_own_settings(spec: EnvSpec, policy: LoadedPolicy | Baseline, request: EvalRequest) -> list[str]:
+    """Return the names of settings of `spec` that an evaluation of the policy has without any `--set`."""
+    if policy.info is None:
+        return []
+    own = policy.info.derive_spec(request.task, EnvChanges(randomize=spec.randomize))
+    unchanged = _list_settings(own.parameters, own.reward_weights, own.events)
+    measured = _list_settings(spec.parameters, spec.reward_weights, spec.events)
+    return [name for name, value in measured.items() if unchanged.get(name) == value]

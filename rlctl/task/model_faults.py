@@ -68,6 +68,8 @@ def find_frames(body: Body) -> str:
 def _find_faults(body: Body, urdf: Urdf, root: ElementTree.Element) -> Iterator[tuple[str, str]]:
     for name, mesh in urdf.undrawn.items():
         yield name, f"its visual mesh {mesh!r} is missing. Its other shapes are drawn."
+    for name, count in urdf.recolored.items():
+        yield name, f"a shape with {count} materials. The first is drawn."
     total = sum(max(0.0, read_mass(link) or 0.0) for link in root.findall("link"))
     for link in root.findall("link"):
         name, mass = link.get("name", ""), read_mass(link) or 0.0

@@ -52,6 +52,8 @@ class Urdf:
     """Meshes of collision shapes that were not found, each with its link."""
     undrawn: dict[str, str] = dataclasses.field(default_factory=dict)
     """Meshes of visual shapes that were not found, by link; its collision shapes are drawn if it has no other."""
+    recolored: dict[str, int] = dataclasses.field(default_factory=dict)
+    """Largest number of materials that a shape has, by link, where it is more than one; the first is used."""
     frames: list[str] = dataclasses.field(default_factory=list)
     """Links without `<inertial>` that weigh `FRAME_MASS`."""
     guessed: list[str] = dataclasses.field(default_factory=list)
@@ -92,11 +94,12 @@ def read_urdf(path: Path, *, fixed: bool = False, inertia_from_file: bool = True
     _check_names(path, root)
     _check_masses(path, root)
     _find_meshes(urdf, root)
+    _remove_repeated_materials(urdf, root)
     _add_masses(urdf, root, fixed)
     urdf.wheels = find_wheels(root)
     if inertia_from_file:
         _raise_moments(urdf, root)
-    urdf.changed = urdf.changed or bool(urdf.frames or urdf.guessed or urdf.raised or urdf.undrawn)
+    urdf.changed = urdf.changed or bool(urdf.frames or urdf.guessed or urdf.raised or urdf.undrawn or urdf.recolored)
     urdf.changed = urdf.changed or find_encoding(path.read_bytes()) == _LATIN
     return urdf
 
@@ -180,6 +183,21 @@ def _draw_collision_shapes(link: Element) -> None:
         drawn = copy.deepcopy(shape)
         drawn.tag = "visual"
         link.append(drawn)
+
+
+def _remove_repeated_materials(urdf: Urdf, root: Element) -> None:
+    """Leave the first material of each shape, the one that PyBullet draws; MuJoCo refuses several.
+
+    Converters of meshes write a material for each part of the mesh. Nothing but the colour depends on it.
+    """
+    for link in root.findall("link"):
+        for shape in [*link.findall("collision"), *link.findall("visual")]:
+            materials = shape.findall("material")
+            for material in materials[1:]:
+                shape.remove(material)
+            if len(materials) > 1:
+                name = link.get("name", "")
+                urdf.recolored[name] = max(urdf.recolored.get(name, 0), len(materials))
 
 
 def _add_masses(urdf: Urdf, root: Element, fixed: bool) -> None:

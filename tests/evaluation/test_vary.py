@@ -16,6 +16,7 @@ from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.evaluation.robustness import apply_axes, read, read_axes
 from rlctl.evaluation.vary import check_gates, format_command, measure_robustness
 from rlctl.output import format_duration
+from rlctl.policy.file import PolicyFile
 from rlctl.runs.report.plots import plot_robustness
 from tests.evaluation.conftest import ENVS, write_run
 
@@ -143,6 +144,19 @@ def test_the_command_for_one_cell_plays_it_and_leaves_the_measurement(vary, rlct
     assert played.returncode == 0, played.stderr
     assert json.loads(played.stdout)["return"]["mean"] == found.cells[-1].mean_return
     assert run.robustness_file.read_bytes() == stored
+
+
+@pytest.mark.pybullet
+def test_the_command_leaves_out_what_the_policy_file_has(tmp_path):
+    run = write_run(tmp_path / "run", f"{ENVS}:Block")
+    own = EnvSpec(f"{ENVS}:Block", {"limit": 5.0}, {"distance": -2.0})
+    PolicyFile.read(run.best_policy).with_info(spec=own).write(run.best_policy)
+    changes = EnvChanges(reward_weights={"distance": -3.0})
+    result = measure_robustness(EvalRequest(str(run.path), episodes=2, changes=changes), ["mass=1:3:2"])
+    (found,) = result.maps
+    assert format_command(result, found, found.cells[0]).partition("--seed 0 ")[2] == (
+        "--set reward_weights.distance=-3.0 --set randomize=false --set events.mass.factor=1"
+    )
 
 
 @pytest.mark.pybullet

@@ -246,6 +246,19 @@ def test_a_missing_visual_mesh_is_a_fault_and_collision_shapes_are_drawn(sim, tm
     assert urdf.root.find("link[@name='arm']/visual/geometry/box") is not None
 
 
+def test_of_several_materials_the_first_is_drawn(sim, tmp_path):
+    colors = {"red": "1 0 0 1", "green": "0 1 0 1", "blue": "0 0 1 1"}
+    materials = "".join(f'<material name="{name}"><color rgba="{rgba}"/></material>' for name, rgba in colors.items())
+    visual = f'<visual><geometry><box size="0.1 0.1 0.1"/></geometry>{materials}</visual>'
+    arm = models.link("arm", 1.0).replace("</link>", f"{visual}{BOX}</link>")
+    file = models.urdf(tmp_path, models.link("base", 1.0), arm, models.joint("turn", "base", "arm"))
+    body = sim.load("robot", file, fixed=True)
+    assert find_model_faults(body) == ["model.urdf, link 'arm': a shape with 3 materials. The first is drawn."]
+    urdf = read_urdf(file)
+    assert urdf.root is not None
+    assert [material.get("name") for material in urdf.root.iterfind("link/visual/material")] == ["red"]
+
+
 @pytest.mark.pybullet
 def test_a_changed_file_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
