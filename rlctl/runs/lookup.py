@@ -72,6 +72,8 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
         raise ArtifactError(f"{text}: not a run of rlctl: it has no run.json{hint}")
     if model := suggestions.explain_model_file(text):
         raise UsageError(model)
+    if is_policy_file(text) and Path(text).is_file():
+        raise UsageError(f"{text}: a policy file, and a run is needed{_hint_at_run(Path(text))}. rlctl eval {text}")
     if Path(text).is_file() and Path(text).suffix != ".zip":
         hint = f"; its run: {Path(text).parent}" if (Path(text).parent / "run.json").is_file() else ""
         raise ArtifactError(f"{text}: neither a run nor a policy (.safetensors, .onnx){hint}. {PLAY_OTHERS}")
@@ -92,6 +94,18 @@ def find_run(text: str | None, root: Path = ROOT, *, to_train: bool = False) -> 
     if ":" in text:  # a task that is named by its file or module
         hint = f" To see it before a training: rlctl replay {text} --policy zero"
     raise ArtifactError(f"no run {text!r}: neither a folder nor a task with a run.{hint}")
+
+
+def is_policy_file(text: str) -> bool:
+    """Return whether a text names a policy file, which need not exist."""
+    return Path(text).suffix in (".safetensors", ".onnx")
+
+
+def _hint_at_run(policy: Path) -> str:
+    for folder in policy.resolve().parents[:2]:  # `best.safetensors` is in a folder of its run
+        if (folder / "run.json").is_file():
+            return f"; its run: {folder}"
+    return "; it has none here"
 
 
 def _suggest_run(text: str, root: Path) -> str:
@@ -173,7 +187,7 @@ def _describe_source_change(task: str, digest: object, since: str) -> str | None
 def _find_policy(text: str | None, which: str, root: Path) -> FoundPolicy:
     if which == PRETRAINED:
         return _find_shipped(text)
-    if text is not None and Path(text).suffix in (".safetensors", ".onnx"):
+    if text is not None and is_policy_file(text):
         path = Path(text)
         if not path.exists():
             raise ArtifactError(f"{path}: no such file")

@@ -270,3 +270,15 @@ def test_a_file_that_is_no_policy(root, make_run):
     assert error(ArtifactError, find_policy, str(run.metrics_file), "best", root) == (
         f"{run.metrics_file}: neither a run nor a policy (.safetensors, .onnx); its run: {run.path}. {PLAY_OTHERS}"
     )
+
+
+def test_a_policy_file_is_no_run(root, make_run):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    policy = run.best_policy
+    policy.parent.mkdir(exist_ok=True)
+    policy.touch()
+    text = f"{policy}: a policy file, and a run is needed; its run: {run.path.resolve()}. rlctl eval {policy}"
+    assert error(UsageError, find_run, str(policy), root) == text
+    alone = root / "walk.onnx"
+    alone.touch()
+    assert "a run is needed; it has none here. rlctl eval" in error(UsageError, find_run, str(alone), root)

@@ -128,9 +128,14 @@ def _make_loop() -> asyncio.AbstractEventLoop:
 def _find_policy(request: RobotRequest, pretrained: bool) -> tuple[Path | None, Policy | None]:
     if pretrained and request.policy is not None:
         raise UsageError("--pretrained and --policy exclude each other")
-    if not pretrained and request.policy is None:
+    named = request.policy
+    if lookup.is_policy_file(request.task):
+        if pretrained or named is not None:
+            raise UsageError(f"{request.task}: a policy file; leave out --policy and --pretrained, or name its task")
+        named = request.task
+    if not pretrained and named is None:
         return None, None
-    found = lookup.find_policy(request.policy or request.task, PRETRAINED if pretrained else "best")
+    found = lookup.find_policy(named or request.task, PRETRAINED if pretrained else "best")
     output.print_notes(found.notes)
     return found.file, load_policy(found.file)
 
@@ -139,7 +144,8 @@ def _choose_spec(task: str, policy: Policy | None, changes: EnvChanges) -> EnvSp
     """Return the environment of the policy's training, or of the task's recipe; a robot measures no stacked frames."""
     if policy is None:
         return changes.apply(resolve_task(task))
-    return dataclasses.replace(policy.info.derive_spec(task, changes).resolve(), frame_stack=1)
+    other = None if lookup.is_policy_file(task) else task
+    return dataclasses.replace(policy.info.derive_spec(other, changes).resolve(), frame_stack=1)
 
 
 def name_actions(info: EnvInfo, env: Any) -> list[str]:

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated
 
-from rlctl.options import EpisodeSeed, Option, TaskName
+from rlctl.options import TASK_FORMS, Argument, EpisodeSeed, Option
 from rlctl_robot.serve.serve_request import Host, KeyFile, Port
 
 
@@ -11,7 +11,14 @@ from rlctl_robot.serve.serve_request import Host, KeyFile, Port
 class RobotRequest:
     """The robot that is simulated, what is wrong with it, and where the program under test connects."""
 
-    task: TaskName
+    task: Annotated[
+        str,
+        Argument(
+            f"{TASK_FORMS} Or a policy file: its task, and commands are compared with the policy.",
+            metavar="TASK",
+            completes="task",
+        ),
+    ]
     policy: Annotated[
         str | None, Option("Compare the commands with this policy: a run, a policy file or a task.", metavar="RUN")
     ] = None

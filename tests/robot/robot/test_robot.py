@@ -89,6 +89,15 @@ def test_commands_are_compared_with_the_policy(tmp_path):
     assert report.scores[0].commands.compared == 10
 
 
+def test_a_policy_file_is_played_in_its_own_task(tmp_path):
+    policy = write_policy(tmp_path / "policy.safetensors", [[-0.25, 0, 0], [0, 0, 0]])
+    report = play(control_by_udp, step_down, task=policy)
+    assert (report.spec.task, report.policy) == (SLIDER, Path(policy))
+    assert report.scores[0].commands.compared == 10
+    with pytest.raises(UsageError, match="a policy file; leave out --policy and --pretrained"):
+        run_robot(RobotRequest(policy, policy=policy), lambda _: None, changes=UNCHANGED, gates=NO_GATES)
+
+
 def test_a_policy_with_a_stack_of_frames_is_compared_with_single_observations(tmp_path):
     # The place is 1, and from the second step on the older of two frames has one step less than the newer.
     weight = [[0, -0.1, 0, 0, 0, 0], [0, 0, 0, 0, 0.1, 0]]
