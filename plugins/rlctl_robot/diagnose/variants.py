@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -19,6 +20,8 @@ _ACTION_FACTORS = (0.25, 0.5, 2.0, 4.0)
 _GAIN_FACTORS = (0.1, 0.5, 2.0, 10.0)
 _RATES = (0.25, 0.5, 2.0, 4.0)
 _SLOWEST = 0.1  # [s], between two actions
+_LEG = re.compile(r"(?P<row>[FRHL])(?P<side>[LR])_|(?P<first>[LR])(?P<second>[FH])_")  # FL_hip, LF_HAA
+_SIDE = re.compile(r"left|right|(?<![a-z])[lr](?=_)", re.IGNORECASE)
 _SIGNED = ("gyroscope", "velocity", "gravity", "joint_positions", "joint_velocities")
 
 
@@ -89,18 +92,48 @@ def _exchange(name: str, one: str, other: str) -> str:
     return other + name[1:] if name.startswith(one) else one + name[1:]
 
 
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where a joint is, as its name says it."""
+
+    row: str  # of legs, `F` and `R`; empty for robots on two legs
+    side: str  # `l` or `r`; empty in the middle
+    kind: str  # the name without these
+
+
+def _read_place(name: str) -> _Place:
+    leg = _LEG.match(name)
+    if leg is not None:
+        row, side = leg["row"] or leg["second"], leg["side"] or leg["first"]
+        return _Place(row, side.lower(), name[leg.end() :])
+    side_name = _SIDE.search(name)
+    if side_name is not None:
+        return _Place("", side_name[0][0].lower(), name[: side_name.start()] + name[side_name.end() :])
+    return _Place("", "", name)
+
+
 def _exchange_sides(joints: Sequence[str]) -> list[int]:
     """Return the order with left and right exchanged, as far as names say what is left."""
-    names = {name: index for index, name in enumerate(joints)}
-    order = []
-    for index, name in enumerate(joints):
-        other = name
-        if name[:2] in ("FL", "RL", "HL", "FR", "RR", "HR"):
-            other = name[0] + ("R" if name[1] == "L" else "L") + name[2:]
-        elif "left" in name or "right" in name:
-            other = name.replace("left", "\0").replace("right", "left").replace("\0", "right")
-        order.append(names.get(other, index))
-    return order
+    places = [_read_place(name) for name in joints]
+    indices = {place: index for index, place in enumerate(places)}
+    other_side = {"l": "r", "r": "l", "": ""}
+    others = [dataclasses.replace(place, side=other_side[place.side]) for place in places]
+    return [indices.get(other, index) for index, other in enumerate(others)]
+
+
+def _list_groups(joints: Sequence[str]) -> dict[tuple[int, ...], str]:
+    """Return the joints of one kind, with their text: of all legs, of one side, of one row."""
+    places = [_read_place(name) for name in joints]
+    groups: dict[tuple[int, ...], str] = {}
+    for by in (("kind",), ("kind", "side"), ("kind", "row")):
+        found: dict[tuple[str, ...], list[int]] = {}
+        for index, place in enumerate(places):
+            if place.side:
+                found.setdefault(tuple(getattr(place, name) for name in by), []).append(index)
+        for group in found.values():
+            if len(group) > 1:
+                groups[tuple(group)] = " and ".join(joints[index] for index in group)
+    return groups
 
 
 def _list_orders(deployment: Deployment, robot: Robot) -> Iterator[Variant]:
@@ -193,6 +226,8 @@ def _list_signs(deployment: Deployment) -> Iterator[Variant]:
     for index, joint in enumerate(deployment.joints):
         changed = _reverse(deployment, kinds, [index])
         yield Variant("sign", f"joint {joint} turns the other way", changed)
+    for group, text in _list_groups(deployment.joints).items():
+        yield Variant("sign", f"joints {text} turn the other way", _reverse(deployment, kinds, group))
     yield Variant(
         "sign", "the actions have the wrong sign", _reverse_actions(deployment, range(len(deployment.joints)))
     )
@@ -227,6 +262,7 @@ def _list_poses(deployment: Deployment, robot: Robot) -> Iterator[Variant]:
     for order, text in _list_joint_orders(deployment, robot):
         poses[f"in another order: {text}"] = [default[index] for index in order]
         poses[f"in another order, from: {text}"] = [default[int(index)] for index in np.argsort(order)]
+    poses |= _copy_legs(joints, default)
     for text, pose in poses.items():
         changed = _change(deployment, default_positions=tuple(pose))
         yield Variant("default pose", f"the policy's default positions are {text}", changed, moves_world=True)
@@ -235,6 +271,22 @@ def _list_poses(deployment: Deployment, robot: Robot) -> Iterator[Variant]:
             changed = _replace_part(deployment, part.kind, relative=not part.relative)
             what = "are angles themselves" if part.relative else "are from the default positions"
             yield Variant("default pose", f"the policy's joint positions {what}", changed, moves_world=True)
+
+
+def _copy_legs(joints: Sequence[str], default: Sequence[float]) -> dict[str, Sequence[float]]:
+    """Return poses in which one leg, or one side, has the positions of its counterpart, with text."""
+    places, others = [_read_place(name) for name in joints], _exchange_sides(joints)
+    poses: dict[str, Sequence[float]] = {}
+    for row, side in dict.fromkeys((place.row, place.side) for place in places if place.side):
+        pose = list(default)
+        for index, place in enumerate(places):
+            if (place.row, place.side) == (row, side):
+                value = default[others[index]]
+                is_mirrored = value * default[index] < 0
+                pose[index] = -value if is_mirrored else value
+        first = next(index for index, place in enumerate(places) if (place.row, place.side) == (row, side))
+        poses[f"those of the other side, at {joints[first]} and the joints of its leg or side"] = pose
+    return poses
 
 
 def _list_frames(deployment: Deployment) -> Iterator[Variant]:
