@@ -159,7 +159,7 @@ def test_a_controller_gets_what_is_measured_and_sends_targets(tmp_path):
     report = play(control_by_udp, act, task=CART, episodes=1, policy=policy, controller=True, fault=["delay=0.2"],
                   options={"reads": "packets"})  # fmt: skip
     healthy, late = report.scores
-    assert report.command == "joint position [rad or m]"
+    assert report.command == "joint position [m]"
     assert (healthy.outcome.success_rate, healthy.commands.held) == (1.0, 0)
     assert (healthy.commands.compared, late.commands.compared) == (120, 120)
     for score in report.scores:
