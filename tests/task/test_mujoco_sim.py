@@ -18,6 +18,7 @@ from rlctl.task.mujoco.opengl import draw_without_display
 from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation.peg_insert import SCARA
+from tests.task import models
 from tests.task.tasks import Cart, Slider
 
 pytest.importorskip("mujoco")
@@ -257,3 +258,26 @@ def test_a_slippery_ground_is_solved_further_until_the_reset():
             assert np.abs(task.body.base_velocity).max() < 10.0
         env.reset(seed=1)
         assert world.mj_model.opt.iterations == iterations
+
+
+def test_changes_before_a_further_load_are_kept(tmp_path):
+    with closing(MujocoSim(control_dt=0.02, substeps=4)) as sim:
+        sim.load("ground", "plane.urdf", fixed=True)
+        wheels = sim.load("wheels", models.two_wheels(tmp_path))
+        box = sim.load("box", "cube_small.urdf", position=(0.0, 0.0, 0.5))
+        wheels.set_joint_damping(0.7)
+        wheels.scale_motor_strength(0.5)
+        box.set_color((0.1, 0.2, 0.3))
+        box.set_contact_stiffness(500.0)
+        (stiff,) = sim.model.pair_solref.copy()  # of the ground and the box
+        sim.load("cube", "cube_small.urdf", position=(1.0, 0.0, 0.1))
+        joints = [sim.model.joint(f"wheels/{name}").id for name in wheels.joint_names]
+        assert sim.model.dof_damping[sim.model.jnt_dofadr[joints]] == pytest.approx([0.7, 0.7])
+        motors = [sim.model.actuator(f"wheels/motor {name}").id for name in wheels.joint_names]
+        assert sim.world.extra["strength"][motors] == pytest.approx([0.5, 0.5])
+        link = sim.model.body(f"box/{box.base_name}").id
+        assert sim.model.geom_rgba[sim.model.geom_bodyid == link, :3][0] == pytest.approx((0.1, 0.2, 0.3))
+        assert sim.world.extra["color"][link] == pytest.approx((0.1, 0.2, 0.3))
+        on_ground = (sim.model.geom_bodyid[sim.model.pair_geom2] == link) & (sim.model.pair_geom1 == 0)
+        assert sim.model.pair_solref[on_ground] == pytest.approx(stiff[None])
+        assert sim.model.pair_solref[~on_ground, 0] == pytest.approx(sim.model.pair_solref[~on_ground, 0].clip(0.0))

@@ -232,15 +232,32 @@ class MujocoScene:
 
 
 def _keep_changes(before: Any, after: Any) -> None:
-    # What a task has changed in `build` before the last change of structure, by the names of bodies and joints.
+    # What a task has changed in `build` before the last change of structure, by the names of the parts.
     for body in range(1, before.nbody):
         number = after.body(before.body(body).name).id
         for name in ("body_mass", "body_inertia", "body_pos", "body_quat"):
             getattr(after, name)[number] = getattr(before, name)[body]
+    for joint in range(before.njnt):
+        old_joint = before.joint(joint)
+        new_joint = after.joint(old_joint.name)
+        for name in ("damping", "frictionloss", "armature"):  # of its degrees of freedom
+            getattr(new_joint, name)[:] = getattr(old_joint, name)
     for actuator in range(before.nu):
         number = after.actuator(before.actuator(actuator).name).id
         for name in ("actuator_biasprm", "actuator_forcerange"):
             getattr(after, name)[number] = getattr(before, name)[actuator]
+    for geom in range(before.ngeom):
+        after.geom(before.geom(geom).name).rgba[:] = before.geom(geom).rgba
+    # MuJoCo sorts pairs, so their numbers change.
+    numbers = {pair: number for number, pair in enumerate(_list_pairs(after))}
+    for pair, names in enumerate(_list_pairs(before)):
+        after.pair_solref[numbers[names]] = before.pair_solref[pair]
+
+
+def _list_pairs(model: Any) -> list[tuple[str, str]]:
+    """Return the names of the geoms of all pairs."""
+    ends = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+    return [(model.geom(one).name, model.geom(two).name) for one, two in ends]
 
 
 def _keep_state(model: Any, data: Any, new_model: Any, new_data: Any) -> None:

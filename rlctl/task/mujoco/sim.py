@@ -174,13 +174,14 @@ class MujocoSim(Sim):
         self._compile()
 
     def _compile(self) -> None:
-        model, data = self._scene.compile(self.world.mj_model, self.world.mj_data)
+        before = self.world.mj_model
+        model, data = self._scene.compile(before, self.world.mj_data)
         self.world.set_model(model, data)
-        self._set_extra(model)
+        self._set_extra(model, before)
         self._look_up()
         self.spread_friction()
 
-    def _set_extra(self, model: Any) -> None:
+    def _set_extra(self, model: Any, before: Any) -> None:
         friction, spin, roll = np.zeros(model.nbody), np.zeros(model.nbody), np.zeros(model.nbody)
         for parts in self._scene.parts.values():
             for link, value in parts.file.friction.items():
@@ -189,9 +190,16 @@ class MujocoSim(Sim):
                     friction[number] = parts.built_friction.get(link, value)
                     spin[number] = parts.file.spin[link]
                     roll[number] = parts.file.roll.get(link, 0.0)
-        self.world.extra |= {"friction": friction, "spin": spin, "roll": roll, "strength": np.ones(model.nu)}
+        self.world.extra |= {"friction": friction, "spin": spin, "roll": roll}
         self.world.extra["ideal motors"] = make_ideal_motors(model.nu)
-        self.world.extra["color"] = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
+        strength = np.ones(model.nu)
+        color = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
+        if "color" in self.world.extra:  # what a task has changed in `build` so far
+            for motor in range(before.nu):
+                strength[model.actuator(before.actuator(motor).name).id] = self.world.extra["strength"][motor]
+            for body in range(before.nbody):
+                color[model.body(before.body(body).name).id] = self.world.extra["color"][body]
+        self.world.extra |= {"strength": strength, "color": color}
         numbers = [[model.body(end).id for end in pair] for pair in self._scene.pairs]
         self._pair_links = np.array(numbers, int).reshape(-1, 2)
 
