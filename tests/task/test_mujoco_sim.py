@@ -281,3 +281,17 @@ def test_changes_before_a_further_load_are_kept(tmp_path):
         on_ground = (sim.model.geom_bodyid[sim.model.pair_geom2] == link) & (sim.model.pair_geom1 == 0)
         assert sim.model.pair_solref[on_ground] == pytest.approx(stiff[None])
         assert sim.model.pair_solref[~on_ground, 0] == pytest.approx(sim.model.pair_solref[~on_ground, 0].clip(0.0))
+
+
+def test_friction_of_contacts_is_that_of_their_links():
+    sim = MujocoSim(control_dt=0.02, substeps=4)
+    sim.load("ground", "plane.urdf", fixed=True)
+    sim.load(
+        "robot", "a1.urdf", position=(0.0, 0.0, 1.0), self_collision=True
+    )  # its pairs are compiled in another order
+    cube = sim.load("cube", "cube_small.urdf")
+    cube.set_friction(0.123)
+    model, friction = sim.model, sim.fields.model("friction")
+    one, two = model.geom_bodyid[model.pair_geom1], model.geom_bodyid[model.pair_geom2]
+    np.testing.assert_allclose(model.pair_friction[:, 0], friction[one] * friction[two])
+    assert (friction[one] * friction[two] == 0.123).any()

@@ -36,8 +36,6 @@ class MujocoScene:
     ) -> None:
         self.mujoco, self.solref, self._visuals = mujoco, solref, visuals
         self.parts: dict[str, Parts] = {}
-        self.pairs: list[tuple[str, str]] = []
-        """Links whose geoms collide, each as BODY/LINK."""
         self.spec = mujoco.MjSpec()
         light_scene(self.spec)
         option = self.spec.option
@@ -222,7 +220,6 @@ class MujocoScene:
             condim=dimensions,
             solref=[self.solref, 1.0],
         )
-        self.pairs.append((first.full_name(link), second.full_name(other)))
 
     def _add_site(self, end: Attachment) -> str:
         name, link = f"site {len(self.spec.sites)}", self.spec.body(f"{end.body.name}/{end.link}")

@@ -200,12 +200,12 @@ class MujocoSim(Sim):
             for body in range(before.nbody):
                 color[model.body(before.body(body).name).id] = self.world.extra["color"][body]
         self.world.extra |= {"strength": strength, "color": color}
-        numbers = [[model.body(end).id for end in pair] for pair in self._scene.pairs]
-        self._pair_links = np.array(numbers, int).reshape(-1, 2)
+        # Of the compiled model, which sorts pairs.
+        self._pair_links = model.geom_bodyid[np.column_stack([model.pair_geom1, model.pair_geom2])]
 
     def spread_friction(self) -> None:
         """Give contacts the product of the frictions of their links, as PyBullet computes it."""
-        if not len(self._scene.pairs):
+        if not len(self._pair_links):
             return
         friction, spin, (one, two) = self.fields.model("friction"), self.fields.model("spin"), self._pair_links.T
         product = friction[..., one] * friction[..., two]
