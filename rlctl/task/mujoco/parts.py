@@ -48,10 +48,6 @@ class Parts:
         self.active: dict[int, object] = {}
         """By joint, the kind of command that is written into the model."""
 
-    def full_name(self, link: str) -> str:
-        """Return the name of a link, or of the world, in the compiled model."""
-        return link if link == WORLD else f"{self.name}/{link}"
-
     def may_collide(self, one: int, two: int) -> bool:
         """Return whether the file's masks let two of its own geoms collide, by MuJoCo's rule."""
         (type_one, affinity_one), (type_two, affinity_two) = self.masks[one], self.masks[two]
