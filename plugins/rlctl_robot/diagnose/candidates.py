@@ -14,13 +14,32 @@ from rlctl_robot.diagnose.correction import EVERYTHING, JOINTS, Correction, Kind
 from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array
 
 _DEGREE = math.pi / 180
-_UNITS = (
-    (_DEGREE, "is in degrees, the policy expects radians"),
-    (1 / _DEGREE, "is in radians, the policy expects degrees"),
-    (1e-3, "is in millimetres (or another unit 1,000 times smaller), the policy expects metres"),
-    (1e3, "is 1,000 times too small"),
-    (1e-2, "is 100 times too large, such as centimetres for metres"),
-)
+_RPM = 2 * math.pi / 60
+_DEGREES = (_DEGREE, "is in degrees, the policy expects radians")
+_RADIANS = (1 / _DEGREE, "is in radians, the policy expects degrees")
+_MILLI = (1e-3, "is in millimetres (or another unit 1,000 times smaller), the policy expects metres")
+_CENTI = (1e-2, "is 100 times too large, such as centimetres for metres")
+_UNITS_OF: dict[str, tuple[tuple[float, str], ...]] = {
+    "rad": (_DEGREES, (2 * math.pi, "is in turns, the policy expects radians")),
+    "deg": (_RADIANS,),
+    "rad/s": (
+        (_DEGREE, "is in degrees per second, the policy expects radians per second"),
+        (2 * math.pi, "is in turns per second, the policy expects radians per second"),
+        (_RPM, "is in turns per minute, the policy expects radians per second"),
+    ),
+    "deg/s": ((1 / _DEGREE, "is in radians per second, the policy expects degrees per second"),),
+    "m": (
+        (1e-3, "is in millimetres, the policy expects metres"),
+        (1e-2, "is in centimetres, the policy expects metres"),
+    ),
+    "m/s": (
+        (1e-3, "is in millimetres per second, the policy expects metres per second"),
+        (1e-2, "is in centimetres per second, the policy expects metres per second"),
+        (1 / 3.6, "is in kilometres per hour, the policy expects metres per second"),
+    ),
+}
+"""Factors that a program confuses, by the unit of the policy."""
+_ANY_UNITS = (_DEGREES, _RADIANS, _MILLI, (1e3, "is 1,000 times too small"), _CENTI)  # where the unit is unknown
 _FACTORS = (0.1, 0.25, 0.5, 2.0, 4.0, 10.0)  # of a gain that is wrong
 _MOST_BLOCKS = 4  # all orders of so many blocks, such as legs, are tried
 _QUATERNION_ORDERS = (
@@ -59,9 +78,10 @@ def _list_of_term(
     size = len(values.mean)
     joints = list(info.joints.names) if info.joints is not None and len(info.joints.names) == size else []
     yield from _list_orders(name, size, joints)
-    yield from _list_raw_orders(name, values, joints, info)
     yield from _list_signs(name, size)
+    yield from _list_units(name, size, info)
     yield from _list_factors(name, size)
+    yield from _list_raw(name, values, joints, info)
     for delay in range(1, MAX_DELAY + 1):
         late = f"{delay} control step{'s' if delay > 1 else ''}"
         text = f"take effect {late} late" if name == ACTIONS else f"is {late} late"
@@ -121,27 +141,26 @@ def _list_orders(name: str, size: int, joints: Sequence[str]) -> Iterator[Correc
         yield Correction(name, "order", text, order=order)
 
 
-def _list_raw_orders(name: str, values: TermStatistics, joints: Sequence[str], info: EnvInfo) -> Iterator[Correction]:
-    """Yield orders of the angles that a program measures or commands, of which the policy's differ by the stance.
+def _list_raw(name: str, values: TermStatistics, joints: Sequence[str], info: EnvInfo) -> Iterator[Correction]:
+    """Yield mistakes of the angles that a program measures or commands, of which the policy's differ by the stance.
 
     A program confuses its own angles: it takes the stance off afterwards, and adds it before. Of angles without a
-    stance, and of joints with equal default positions, these are the orders of `_list_orders`.
+    stance, and of joints with equal default positions, these are the mistakes of the policy's values.
     """
     stance = find_stance(name, values, info)
     if stance is None:
         return
-    pose, scale = stance
-    for order, text in list_permutations(len(pose), joints).items():
-        # program's angle = pose + scale * value, so value = (pose[order] + scale[order] * logged[order] - pose) / scale
-        there = list(order)
-        offset = (pose[there] - pose) / scale
-        factor = scale[there] / scale
-        if not np.allclose(offset, 0.0) or not np.allclose(factor, 1.0):
-            factors = () if np.allclose(factor, 1.0) else tuple(factor.tolist())
-            what = "among the joints' targets" if name == ACTIONS else "before the stance is subtracted"
-            yield Correction(
-                name, "order", f"{text}, {what}", order=order, factor=factors, offset=tuple(offset.tolist())
-            )
+    size = len(values.mean)
+    what = "among the joints' targets" if name == ACTIONS else "before the stance is subtracted"
+    mistakes: list[Correction] = [*_list_orders(name, size, joints)]
+    if name != ACTIONS:
+        mistakes += [*_list_signs(name, size), *_list_units(name, size, info)]
+    for one in mistakes:
+        order = one.order or tuple(range(size))
+        factor = one.factor or (1.0,) * size
+        raw = _make_part(name, values, info, one.kind, order, factor)
+        if raw.offset or not np.allclose(raw.factor, factor):
+            yield dataclasses.replace(raw, text=f"{one.text}, {what}")
 
 
 def list_joint_mistakes(info: EnvInfo, statistics: Mapping[str, TermStatistics]) -> list[Correction]:
@@ -205,19 +224,22 @@ def _name_reversed(factor: tuple[float, ...], names: Sequence[str]) -> str:
 
 
 def _make_part(
-    name: str, values: TermStatistics, info: EnvInfo, kind: Kind, order: tuple[int, ...], sign: tuple[float, ...]
+    name: str, values: TermStatistics, info: EnvInfo, kind: Kind, order: tuple[int, ...], factor: tuple[float, ...]
 ) -> Correction:
-    """Return what exchanged or reversed angles of a driver are in an observation or in the actions."""
+    """Return what exchanged, reversed or otherwise measured angles are in an observation or in the actions.
+
+    The right angles are `factor * angle[order]`.
+    """
     stance = find_stance(name, values, info)
     if stance is None:
-        return Correction(name, kind, "", order, sign)
+        return Correction(name, kind, "", order, factor)
     pose, scale = stance
-    there, signs = list(order), np.array(sign)
-    # program's angle = pose + scale * value; the right one is sign * angle[order].
-    offset = (signs * pose[there] - pose) / scale
-    factor = signs * scale[there] / scale
+    there, factors = list(order), np.array(factor)
+    # program's angle = pose + scale * value; the right one is factor * angle[order].
+    offset = (factors * pose[there] - pose) / scale
+    of_values = factors * scale[there] / scale
     shifts = () if np.allclose(offset, 0.0) else tuple(offset.tolist())
-    return Correction(name, kind, "", order, tuple(factor.tolist()), shifts)
+    return Correction(name, kind, "", order, tuple(of_values.tolist()), shifts)
 
 
 def find_stance(name: str, values: TermStatistics, info: EnvInfo) -> tuple[Array, Array] | None:
@@ -260,9 +282,13 @@ def name_elements(elements: Sequence[int], size: int, verb: tuple[str, str] = ("
     return f"elements {', '.join(str(index) for index in elements)} {verb[1]}"
 
 
-def _list_factors(name: str, size: int) -> Iterator[Correction]:
-    for factor, text in _UNITS:
+def _list_units(name: str, size: int, info: EnvInfo) -> Iterator[Correction]:
+    """Yield the units with which a program confuses that of a term; a joint's angle is never in millimetres."""
+    for factor, text in _UNITS_OF.get(info.observation_units.get(name, ""), _ANY_UNITS):
         yield Correction(name, "unit", text, factor=(factor,) * size)
+
+
+def _list_factors(name: str, size: int) -> Iterator[Correction]:
     for factor in _FACTORS:
         yield make_scale(name, size, range(size), factor)
         if size > 1 and factor in (0.5, 2.0):

@@ -67,7 +67,7 @@ def build_mapping(
     terms = _compose_terms(of_robot, sizes)
     if is_of_controller and joints is not None and joints.measured in terms:
         own = [one for one in of_robot if one.term == joints.measured]
-        if joints.default_positions and all(one.kind in ("order", "sign") for one in own):
+        if joints.default_positions and all(one.kind in ("order", "sign", "unit") for one in own):
             pose = np.array(joints.default_positions)
             terms[joints.measured] = _shift(terms[joints.measured], pose, np.ones(len(pose)))
     return CorrectedMapping(

@@ -172,3 +172,10 @@ def test_only_what_explains_something_is_a_mistake_of_the_mapping(findings, unex
     diagnosis = Diagnosis(Path("log.csv"), "p", "t", 100, 1.0, (), answers, tuple(findings), mapping)
     with pytest.raises(AnswerIsNo, match=message):
         diagnosis.check()
+
+
+def test_a_unit_of_measured_angles_has_no_offset_for_a_controller():
+    degree, pose = np.pi / 180, np.array(ARM.default_positions)
+    unit = Correction("q", "unit", "", factor=(degree,) * 3, offset=tuple((degree - 1) * pose))
+    of_controller = build_mapping([], [unit], {"q": 3}, ARM, is_of_controller=True).observations["q"]
+    assert of_controller.model_dump(exclude_defaults=True) == {"scale": [0.017453] * 3}

@@ -68,7 +68,9 @@ def test_degrees_and_a_frozen_sensor_in_one_log(doctor, robot):
     degrees = Wrong("joint_velocities", "unit", factor=(180 / np.pi,) * 7)
     findings, _, _ = diagnose(doctor, robot, degrees, Wrong("hand", "stuck", stuck=(2,)))
     assert findings[0].text.startswith("hand: element 2 is frozen at")
-    assert "joint_velocities: is in degrees, the policy expects radians" in [finding.text for finding in findings]
+    assert "joint_velocities: is in degrees per second, the policy expects radians per second" in [
+        finding.text for finding in findings
+    ]
 
 
 @pytest.mark.slow

@@ -252,3 +252,37 @@ def test_a_swap_of_a_programs_own_angles(info):
     # Where angles themselves are observed, near the stance, a swap of the values is the same.
     near = {"positions": TermStatistics(np.array([0.1, -0.5]), np.ones(2))}
     assert not [one for one in list_candidates(info, near) if one.kind == "order" and one.offset]
+
+
+def list_units(info, unit, mean=0.0):
+    joints = Joints(["shoulder", "elbow"], default_positions=[0.1, -0.5], measured="positions")
+    info = info.model_copy(update={"joints": joints, "observation_units": {"positions": unit}})
+    statistics = {"positions": TermStatistics(np.full(2, mean), np.ones(2))}
+    return [one for one in list_candidates(info, statistics) if one.kind == "unit"]
+
+
+def test_units_are_those_of_the_quantity(info):
+    degree = np.pi / 180
+    angles = {round(one.factor[0], 6) for one in list_units(info, "rad")}
+    assert angles == {round(degree, 6), round(2 * np.pi, 6)}  # never millimetres
+    assert {one.factor[0] for one in list_units(info, "m")} == {1e-3, 1e-2}
+    assert {round(one.factor[0], 6) for one in list_units(info, "rad/s")} >= {round(degree, 6)}
+    assert 1e-3 not in {one.factor[0] for one in list_units(info, "rad/s")}
+
+
+def test_degrees_are_of_the_measured_angles(info):
+    # The stance is 0.1 and -0.5 rad. Angles 0.3 and 0.2 rad are 0.2 and 0.7 from it; in degrees 17.1887 and 11.4592,
+    # of which a program takes 0.1 and -0.5.
+    degrees = next(one for one in list_units(info, "rad") if one.offset and "degrees" in one.text)
+    assert degrees.change(np.array([17.1887 - 0.1, 11.4592 + 0.5])) == pytest.approx([0.2, 0.7], abs=1e-5)
+    assert degrees.text == "is in degrees, the policy expects radians, before the stance is subtracted"
+
+
+def test_signs_are_of_the_measured_angles_too(info):
+    joints = Joints(["shoulder", "elbow"], default_positions=[0.1, -0.5], measured="positions")
+    info = info.model_copy(update={"joints": joints, "observation_units": {"positions": "rad"}})
+    statistics = {"positions": TermStatistics(np.zeros(2), np.ones(2))}
+    signs = [one for one in list_candidates(info, statistics) if one.kind == "sign" and one.offset]
+    # The angle 0.2 of the elbow is 0.7 from the stance; -0.2 is 0.3 from it.
+    elbow = next(one for one in signs if one.text == "element 1 has the wrong sign, before the stance is subtracted")
+    assert elbow.change(np.array([0.0, 0.3])) == pytest.approx([0.0, 0.7])
