@@ -42,11 +42,15 @@ _UNITS_OF: dict[str, tuple[tuple[float, str], ...]] = {
 _ANY_UNITS = (_DEGREES, _RADIANS, _MILLI, (1e3, "is 1,000 times too small"), _CENTI)  # where the unit is unknown
 _FACTORS = (0.1, 0.25, 0.5, 2.0, 4.0, 10.0)  # of a gain that is wrong
 _MOST_BLOCKS = 4  # all orders of so many blocks, such as legs, are tried
+FROM_W_FIRST = (1, 2, 3, 0)
+"""Elements of a quaternion (w, x, y, z) in the order x, y, z, w."""
 _QUATERNION_ORDERS = (
-    ((1, 2, 3, 0), "the quaternion is in the order w, x, y, z, the policy expects x, y, z, w"),
+    (FROM_W_FIRST, "the quaternion is in the order w, x, y, z, the policy expects x, y, z, w"),
     ((3, 0, 1, 2), "the quaternion is in the order x, y, z, w, the policy expects w, x, y, z"),
 )
-_CONJUGATES = ((-1.0, -1.0, -1.0, 1.0), (1.0, -1.0, -1.0, -1.0))
+CONJUGATE = (-1.0, -1.0, -1.0, 1.0)
+"""Factors of the inverse of a quaternion (x, y, z, w)."""
+_CONJUGATES = (CONJUGATE, (1.0, -1.0, -1.0, -1.0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from rlctl_robot.diagnose.candidates import (
 from rlctl_robot.diagnose.correction import JOINTS, Correction, correct
 from rlctl_robot.diagnose.evidence import Likelihood, Scorer
 from rlctl_robot.diagnose.frozen import Frozen, find_frozen
+from rlctl_robot.diagnose.inputs import ControllerInputs
 from rlctl_robot.diagnose.joints import FEWEST_ROWS, Judgement, judge
 from rlctl_robot.diagnose.limited import find_limited_rows
 from rlctl_robot.diagnose.log import RobotLog, read_robot_log
@@ -30,7 +31,7 @@ from rlctl_robot.diagnose.physics import make_physics
 from rlctl_robot.diagnose.policy_match import SAME, Matcher, PolicyMatch, describe_in_log
 from rlctl_robot.diagnose.reference import record_mistakes, record_reference
 from rlctl_robot.diagnose.rows import ChosenRows, choose_rows
-from rlctl_robot.diagnose.search import Found, Search
+from rlctl_robot.diagnose.search import EVIDENCE, LEAST_SHARE, Found, Search
 from rlctl_robot.diagnose.signals import ACTIONS, MAX_DELAY, Array, LoggedSignals
 
 MOST = 5  # findings that are listed
@@ -91,6 +92,9 @@ class Answers:
     """Per observation: how many times larger than in simulation errors are, as logged and corrected."""
     step_error: tuple[float, float]  # the same of the prediction of the next row from this row and the action
     unexplained: str = ""  # how the log differs although no mistake was found
+    simulated_error: tuple[float, float] | None = None
+    """Loss of the simulation that is set to each logged row, relative to the worst of a sound robot: as logged and
+    corrected, where it decided what is wrong."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,13 +174,12 @@ class Doctor:
         signals: LoggedSignals,
         limits: Limits | None = None,
         limited: Array | None = None,
-        *,
-        is_of_controller: bool = False,
+        inputs: ControllerInputs | None = None,
     ) -> tuple[list[MappingFinding], Answers, CorrectedMapping]:
         """Return the mistakes, the one with the most evidence first, the answers in numbers and the mapping.
 
         Actions that `limits` have changed, and those of the rows in `limited`, shape (T,), are not compared with those
-        of the policy. The mapping is of angles themselves for the log of a program that runs a controller.
+        of the policy. The mapping is of `inputs` for the log of a program that runs a controller.
         """
         if not len(signals.inner_rows(self.likelihood.margin)):
             longest, needed = max(signals.lengths), 2 * self.likelihood.margin + 1
@@ -195,7 +198,15 @@ class Doctor:
         stuck = [(one.term, element) for one in frozen for element in one.elements]
         used = len(match.corrections) + bool(match.variant.text) + len(frozen)
         self._report("searching for corrections with which the signals depend on each other as in simulation")
-        found = self._search(corrected, stuck, max(0, 2 - used))
+        most = max(0, 2 - used)
+        found = self._search(corrected, stuck, most)
+        of_inputs = None
+        if inputs is not None and most:
+            of_inputs = self._find_input_mistake(inputs, corrected, match, found, stuck)
+        if of_inputs is not None:
+            corrected = self._correct_input(inputs, of_inputs.correction, signals, match)
+            found = self._search(corrected, stuck, most - 1)
+            findings.append(_make_finding(of_inputs, of_inputs.correction.describe()))
         judgement, is_too_short = None, False
         if self.physics is not None and not frozen:
             self._report(
@@ -208,23 +219,16 @@ class Doctor:
             else:
                 found = list(judgement.found)
         for one in found:
-            findings.append(
-                MappingFinding(
-                    3 if one.correction.term in (ACTIONS, JOINTS) else 2,
-                    one.correction.term,
-                    one.correction.kind,
-                    _describe_on_robot(one.correction),
-                    one.evidence,
-                    one.explains,
-                    tuple(other.describe() for other in one.also),
-                    one.correction,
-                )
-            )
+            findings.append(_make_finding(one, _describe_on_robot(one.correction, inputs)))
         findings.sort(key=lambda finding: (not finding.is_mistake, -finding.evidence))
         findings = _mark_weak(findings)[:MOST]
         weak = [finding.correction for finding in findings if finding.is_weak]
         of_robot = [one.correction for one in found]
         answers = self._answer(signals, corrected, of_robot, match, stuck)
+        if judgement is not None and judgement.adds_mistake:
+            answers = dataclasses.replace(
+                answers, simulated_error=(judgement.times_usual_before, judgement.times_usual)
+            )
         if is_unknown:
             answers = dataclasses.replace(answers, policy_difference=None, policy_difference_corrected=None)
         if not any(finding.is_mistake for finding in findings):
@@ -233,9 +237,16 @@ class Doctor:
                 unexplained = _TOO_SHORT
             answers = dataclasses.replace(answers, unexplained=unexplained)
         mapped = [one for one in of_robot if one not in weak and not _has_large_gain(one)]
-        env = self.policy.info.env
+        mapped = [one for one in mapped if not _list_sources(one, inputs)]
+        if of_inputs is not None:
+            mapped.append(of_inputs.correction)
         mapping = build_mapping(
-            match.corrections, mapped, dict(signals.sizes), env.joints, is_of_controller=is_of_controller
+            match.corrections,
+            mapped,
+            dict(signals.sizes),
+            self.policy.info.env.joints,
+            is_of_controller=inputs is not None,
+            quaternions=() if inputs is None else inputs.quaternions,
         )
         return findings, answers, mapping
 
@@ -280,6 +291,38 @@ class Doctor:
             mistakes += search.list_guesses(_GUESSES, first)
         recordings = record_mistakes(self.spec, self.actor, mistakes, _GUESS_STEPS * len(mistakes), self._seed)
         return Search(self.likelihood.learn_more(recordings), signals, self.candidates, stuck).find(most) or found
+
+    def _find_input_mistake(
+        self,
+        inputs: ControllerInputs,
+        corrected: LoggedSignals,
+        match: PolicyMatch,
+        found: Sequence[Found],
+        stuck: Sequence[tuple[str, int]],
+    ) -> Found | None:
+        """Return the mistake of an input that explains the log better than `found`, what was found without it."""
+        rows = self._choose_rows(corrected)
+        before = Scorer(self.likelihood, corrected, rows, stuck)
+        nothing = before.score
+        with_found = before.rebase([one.correction for one in found])
+        before.rebase([])
+        best = None
+        for mistake in inputs.list_mistakes():
+            right = self._correct_input(inputs, mistake, corrected, match)
+            after = Scorer(self.likelihood, right, rows, stuck)
+            evidence, share = nothing - after.score, before.share_of(after)
+            is_convincing = evidence >= EVIDENCE and share >= LEAST_SHARE and after.score < with_found
+            if is_convincing and (best is None or evidence > best.evidence):
+                best = Found(mistake, evidence, share)
+        return best
+
+    def _correct_input(
+        self, inputs: ControllerInputs, mistake: Correction, signals: LoggedSignals, match: PolicyMatch
+    ) -> LoggedSignals:
+        """Return the log as it were without a mistake of an input, with the corrections of the log alone."""
+        observations = inputs.compute_observations(mistake)
+        changed = dataclasses.replace(signals, observations=observations, actions=inputs.actions)
+        return correct(changed, match.corrections)
 
     def _match(self, signals: LoggedSignals, frozen: Sequence[Frozen], limited: Array | None) -> PolicyMatch:
         std = self.likelihood.reference.statistics[ACTIONS].std
@@ -399,7 +442,23 @@ def _has_large_gain(one: Correction) -> bool:
     return bool((np.maximum(factors, 1 / factors) > _MOST_GAIN).any())
 
 
-def _describe_on_robot(one: Correction) -> str:
+def _make_finding(one: Found, text: str) -> MappingFinding:
+    correction = one.correction
+    question: Literal[2, 3] = 3 if correction.term in (ACTIONS, JOINTS) else 2
+    also = tuple(other.describe() for other in one.also)
+    return MappingFinding(
+        question, correction.term, correction.kind, text, one.evidence, one.explains, also, correction
+    )
+
+
+def _list_sources(one: Correction, inputs: ControllerInputs | None) -> tuple[str, ...]:
+    """Return the inputs to correct instead of an observation that the program does not have."""
+    return () if inputs is None else inputs.find_sources(one.term)
+
+
+def _describe_on_robot(one: Correction, inputs: ControllerInputs | None = None) -> str:
+    if sources := _list_sources(one, inputs):
+        return f"{one.describe()} (not in the mapping: it is computed from {', '.join(sources)})"
     if not _has_large_gain(one):
         return one.describe()
     return f"{one.describe()} (not in the mapping: look for the cause at the motors, such as a sign or a gain)"
@@ -430,9 +489,7 @@ def diagnose_log(
         threadpool_limits(1, "blas"),  # with other programs on the same cores, threads wait for each other
         contextlib.closing(Doctor(policy, spec, seed, others, report=report)) as doctor,
     ):
-        findings, answers, mapping = doctor.diagnose(
-            log.signals, bounds, log.limited, is_of_controller=log.is_of_controller
-        )
+        findings, answers, mapping = doctor.diagnose(log.signals, bounds, log.limited, log.inputs)
     rows = len(log.signals.actions)
     return Diagnosis(
         log=path,

@@ -207,8 +207,14 @@ class Scorer:
 
     def share(self, one: Correction) -> float:
         """Return which part of the errors that it changes a correction explains, in [0, 1]."""
-        typical = self._likelihood.relations.typical
-        before, after = self._losses, self._try(one)
+        return self._explain(self._try(one))
+
+    def share_of(self, other: "Scorer") -> float:
+        """Return which part of the errors that differ another log of the same rows explains, in [0, 1]."""
+        return self._explain(other._losses)
+
+    def _explain(self, after: Array) -> float:
+        typical, before = self._likelihood.relations.typical, self._losses
         better = self._weights * (before > after + 0.05)
         removable = float(np.maximum(before - np.minimum(typical, before), before - after) @ better)
         return float((before - after) @ better) / max(removable, 1e-9)

@@ -28,6 +28,8 @@ class Judgement:
 
     found: tuple[Found, ...]
     times_usual: float  # loss relative to the largest of a sound robot
+    times_usual_before: float  # the same of the log without corrections
+    adds_mistake: bool = False  # whether it found a mistake of the joints
 
 
 def judge(
@@ -55,10 +57,11 @@ def judge(
         rows, starts = FEWEST_ROWS, physics.choose_starts(signals, FEWEST_ROWS, _PARTS)
     blocks = _measure(physics, signals, explanations, starts, rows)
     plain = _choose_plain(blocks[: len(subsets)], subsets)
+    uncorrected = float(blocks[0].mean()) / physics.usual_loss  # the first subset is empty
     chosen = _choose_joints(blocks, plain, len(subsets), explanations)
     if chosen is None:
         kept = tuple(one for one in found if one.correction in subsets[plain])
-        return Judgement(kept, float(blocks[plain].mean()) / physics.usual_loss)
+        return Judgement(kept, float(blocks[plain].mean()) / physics.usual_loss, uncorrected)
     mistake = explanations[chosen][-1]
     before = int(np.flatnonzero([some == explanations[chosen][:-1] for some in subsets])[0])
     deviation, share = _compare(blocks[before], blocks[chosen])
@@ -70,7 +73,8 @@ def judge(
     evidence = min(0.5 * deviation**2, _MOST_EVIDENCE)
     kept = tuple(one for one in found if one.correction in explanations[chosen])
     first_found = Found(mistake, evidence, share, tuple(dict.fromkeys(alike))[:2])
-    return Judgement((first_found, *kept), float(blocks[chosen].mean()) / physics.usual_loss)
+    corrected = float(blocks[chosen].mean()) / physics.usual_loss
+    return Judgement((first_found, *kept), corrected, uncorrected, adds_mistake=True)
 
 
 def _measure(

@@ -1,18 +1,16 @@
 """From the columns of a log to segments of signals: time, rate, gaps and episodes are checked."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from rlctl.environments.info import EnvInfo
 from rlctl.errors import ArtifactError
-from rlctl.exporting.controller.observation import ControllerObservation
-from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.storage.lerobot import is_lerobot_dataset
 from rlctl_robot.diagnose.columns import ColumnAssignment, assign_columns
 from rlctl_robot.diagnose.dataset import read_dataset, read_dataset_header
+from rlctl_robot.diagnose.inputs import ControllerInputs
 from rlctl_robot.diagnose.recording import read_recording
 from rlctl_robot.diagnose.signals import Array, LoggedSignals
 from rlctl_robot.diagnose.table import LogTable, TableHeader, read_header, read_table
@@ -34,7 +32,7 @@ class RobotLog:
     notes: tuple[str, ...]
     kept: Array  # rows of the table that became rows of the signals
     limited: Array | None = None  # shape (T,): the server held the robot or limited the action; None if unknown
-    is_of_controller: bool = False  # whether it holds what a controller takes, not what the policy observes
+    inputs: ControllerInputs | None = None  # where it holds what a controller takes, not what the policy observes
 
     def row(self, index: int) -> int:
         """Return the line or row of the file for a row of the signals."""
@@ -66,12 +64,13 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     lengths, notes = _split(table, assigned, info.control_dt)
     observations, actions = assigned.stack(table.columns)
     sizes = {name: len(some) for name, some in assigned.observations.items()}
-    if assigned.is_of_controller:
-        observations = _compute_observations(info, sizes, observations, actions, lengths)
-        sizes = dict(info.observation_sizes)
     keep = np.repeat(np.array(lengths) >= _LEAST_SEGMENT, lengths)
     kept_lengths = tuple(length for length in lengths if length >= _LEAST_SEGMENT)
-    signals = LoggedSignals(observations[keep], actions[keep], kept_lengths, sizes)
+    observations, actions, inputs = observations[keep], actions[keep], None
+    if assigned.is_of_controller and len(observations):
+        inputs = ControllerInputs(info, sizes, observations, actions, kept_lengths)
+        observations, sizes = inputs.compute_observations(), dict(info.observation_sizes)
+    signals = LoggedSignals(observations, actions, kept_lengths, sizes)
     if sum(kept_lengths) < _LEAST_ROWS:
         gap = f", the first gap is before {table.row_word} {table.rows[lengths[0]]}" if len(lengths) > 1 else ""
         raise ArtifactError(
@@ -84,24 +83,7 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
             "they are not compared with the policy's actions"
         )
     all_notes = [*([table.note] if table.note else []), *assigned.notes, *notes]
-    return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep), limited, assigned.is_of_controller)
-
-
-def _compute_observations(
-    info: EnvInfo, sizes: Mapping[str, int], inputs: Array, actions: Array, lengths: Sequence[int]
-) -> Array:
-    """Return what the policy observes for the inputs of a controller, a row per step."""
-    observation, ends = ControllerObservation(ControllerPlan(info)), np.cumsum(list(sizes.values()))[:-1]
-    rows = []
-    for start, length in zip(np.cumsum([0, *lengths[:-1]]).tolist(), lengths, strict=True):
-        observation.begin()
-        for step in range(length):
-            row = start + step
-            last_action = actions[row - 1] if step else np.zeros_like(actions[row])
-            measured = dict(zip(sizes, np.split(inputs[row], ends), strict=True))
-            parts = observation.observe(measured, step, last_action)
-            rows.append(np.concatenate([np.ravel(parts[name]) for name in info.observation_sizes]))
-    return np.array(rows)
+    return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep), limited, inputs)
 
 
 def _split(table: LogTable, assigned: ColumnAssignment, control_dt: float | None) -> tuple[list[int], list[str]]:

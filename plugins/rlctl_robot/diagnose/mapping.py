@@ -1,6 +1,6 @@
 """The corrected mapping as data: what a program must do to logged values and to actions, per observation."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from rlctl_robot.diagnose.signals import ACTIONS
 class TermMapping(Section):
     """corrected = sign * scale * value[order] + offset; a key that is left out changes nothing."""
 
-    order: list[Whole] | None = None
-    """Element of the program's value for each element of the policy's."""
+    order: list[Whole] | list[str] | None = None
+    """Element of the program's value for each element of the policy's; of a quaternion, the program's x, y, z and w."""
     sign: list[Number] | None = None
     """1 or -1 for each element."""
     scale: list[Number] | None = None
@@ -55,10 +55,12 @@ def build_mapping(
     joints: Joints | None = None,
     *,
     is_of_controller: bool = False,
+    quaternions: Collection[str] = (),
 ) -> CorrectedMapping:
     """Return the mapping that corrections of the log alone and of the robot make.
 
-    With `is_of_controller` the program has angles where the policy observes differences from the stance.
+    With `is_of_controller` the program has angles where the policy observes differences from the stance, and needs only
+    what to do to the targets. The elements of `quaternions` (x, y, z, w) are named.
     """
     of_log, of_robot = list_parts(of_log), list_parts(of_robot)
     sent = [one for one in of_robot if one.term == ACTIONS]
@@ -70,12 +72,27 @@ def build_mapping(
         if joints.default_positions and all(one.kind in ("order", "sign", "unit") for one in own):
             pose = np.array(joints.default_positions)
             terms[joints.measured] = _shift(terms[joints.measured], pose, np.ones(len(pose)))
+    for name in terms.keys() & set(quaternions):
+        terms[name] = _name_elements(terms[name])
+    actions, targets = invert(sent) if sent else None, None
+    if sent and joints is not None:
+        targets = _find_targets(sent, of_robot, joints)
+    if is_of_controller and targets is not None:
+        actions = None  # the program does not see the policy's actions
     return CorrectedMapping(
         observations=terms,
-        actions=invert(sent) if sent else None,
-        targets=_find_targets(sent, of_robot, joints) if sent and joints is not None else None,
+        actions=actions,
+        targets=targets,
         log=LogMapping(observations=observations, actions=log_actions) if of_log else None,
     )
+
+
+def _name_elements(mapping: TermMapping) -> TermMapping:
+    """Return the mapping of a quaternion with the names of the program's elements, such as w, x, y, z."""
+    if not mapping.order:
+        return mapping
+    places = np.argsort(mapping.order)  # element of the policy's quaternion for each of the program's
+    return mapping.model_copy(update={"order": ["xyzw"[place] for place in places]})
 
 
 def _compose_terms(corrections: Sequence[Correction], sizes: dict[str, int]) -> dict[str, TermMapping]:

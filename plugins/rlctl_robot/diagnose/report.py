@@ -39,7 +39,14 @@ def show(result: Diagnosis, json: str | None) -> None:
             out.print(f"- {finding.describe()}", soft_wrap=True)
     if mapping:
         out.print("\nthe corrected mapping, corrected = sign * scale * value[order] + offset:")
-        out.print(yaml_text.dump(mapping), end="", soft_wrap=True)
+        targets = mapping.pop("targets", None)
+        if mapping:
+            out.print(yaml_text.dump(mapping), end="", soft_wrap=True)
+        if targets is not None:
+            if "actions" in mapping:
+                note = "# the same for a program that sends targets of joints; it does not apply `actions`"
+                out.print(note, soft_wrap=True)
+            out.print(yaml_text.dump({"targets": targets}), end="", soft_wrap=True)
 
 
 def _describe_difference(answers: Answers) -> str:
@@ -57,14 +64,23 @@ def describe_answers(result: Diagnosis) -> list[str]:
     first = f"1. does the policy produce the logged actions? {_describe_difference(answers)}"
     odd = sorted(answers.term_errors.items(), key=lambda item: -item[1][0])
     found = {finding.term for finding in result.findings if finding.question == 2}
-    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD or name in found]
+    better = {name for name, (before, after) in odd if after < before}
+    odd = [(name, errors) for name, errors in odd if errors[0] > _ODD or name in found & better]
     second = "2. are the observations those of the simulation? "
     if odd:
         named = ", ".join(f"{name} {before:.3g} -> {after:.3g}" for name, (before, after) in odd[:_FEW])
         second += f"errors in units of the usual ones, as logged and corrected: {named}"
     else:
         second += "yes"
-    before, after = answers.step_error
-    third = f"3. does the simulation predict the next row? errors are {before:.3g} times the usual ones"
-    third += f", {after:.3g} times when corrected" if result.findings else ""
-    return [first, second, third]
+    return [first, second, f"3. does the simulation predict the next row? {_describe_step(result)}"]
+
+
+def _describe_step(result: Diagnosis) -> str:
+    """Return how well the next row is predicted, by the statistic that decided what is wrong."""
+    (before, after), usual = result.answers.step_error, "the usual ones"
+    if result.answers.simulated_error is not None:
+        (before, after), usual = result.answers.simulated_error, "those of the worst sound robot, row by row"
+    text = f"errors are {before:.3g} times {usual}"
+    if result.findings and after < before:
+        text += f", {after:.3g} times when corrected"
+    return text

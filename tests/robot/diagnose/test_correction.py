@@ -1,5 +1,6 @@
 """Corrections and the mapping that they make together, computed by hand."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 from rlctl.errors import AnswerIsNo
 from rlctl.task.joints import Joints
-from rlctl_robot.diagnose.candidates import list_permutations, make_scale, make_sign
+from rlctl_robot.diagnose.candidates import FROM_W_FIRST, list_permutations, make_scale, make_sign
 from rlctl_robot.diagnose.correction import Correction, correct
 from rlctl_robot.diagnose.diagnose import (
     Answers,
@@ -18,6 +19,7 @@ from rlctl_robot.diagnose.diagnose import (
     _mark_weak,
 )
 from rlctl_robot.diagnose.mapping import build_mapping, compose, invert
+from rlctl_robot.diagnose.report import describe_answers, show
 from rlctl_robot.diagnose.signals import LoggedSignals, shift
 
 ARM = Joints(["a", "b", "c"], default_positions=[0.1, 0.5, 0.0], action_scale=[0.2, 0.4, 1.0], measured="q")
@@ -179,3 +181,48 @@ def test_a_unit_of_measured_angles_has_no_offset_for_a_controller():
     unit = Correction("q", "unit", "", factor=(degree,) * 3, offset=tuple((degree - 1) * pose))
     of_controller = build_mapping([], [unit], {"q": 3}, ARM, is_of_controller=True).observations["q"]
     assert of_controller.model_dump(exclude_defaults=True) == {"scale": [0.017453] * 3}
+
+
+def test_a_controllers_program_gets_one_mapping_of_what_it_sends():
+    swap = Correction("actions", "order", "", order=(1, 0, 2), offset=(2.0, -1.0, 0.0), factor=(2.0, 0.5, 1.0))
+    both = build_mapping([], [swap], {"q": 3}, ARM)
+    assert both.actions is not None
+    assert both.targets is not None
+    of_controller = build_mapping([], [swap], {"q": 3}, ARM, is_of_controller=True)
+    assert of_controller.actions is None
+    assert of_controller.targets == both.targets
+
+
+def test_the_elements_of_a_quaternion_are_named():
+    w_first = Correction("orientation", "order", "", order=FROM_W_FIRST)
+    # The program's 0, 1, 2, 3 are w, x, y, z: the policy's x is element 1.
+    assert w_first.change(np.array([0.9, 0.1, 0.2, 0.3])).tolist() == [0.1, 0.2, 0.3, 0.9]
+    mapping = build_mapping([], [w_first], {"gravity": 3}, is_of_controller=True, quaternions=["orientation"])
+    assert mapping.model_dump(exclude_defaults=True) == {
+        "observations": {"orientation": {"order": ["w", "x", "y", "z"]}}
+    }
+
+
+def make_diagnosis(answers, mapping, findings=()):
+    return Diagnosis(Path("log.csv"), "p", "t", 100, 1.0, (), answers, tuple(findings), mapping)
+
+
+def test_what_decided_is_what_is_printed():
+    found = [make_finding(0.9, 900.0)]
+    worse = make_diagnosis(Answers(0.0, 0.0, {"q": (1.0, 1.2)}, (1.35, 1.43)), build_mapping([], [], {}), found)
+    lines = describe_answers(worse)
+    assert lines[1] == "2. are the observations those of the simulation? yes"
+    assert lines[2].endswith("errors are 1.35 times the usual ones")
+    simulated = dataclasses.replace(worse.answers, simulated_error=(3.2, 0.8))
+    line = describe_answers(dataclasses.replace(worse, answers=simulated))[2]
+    assert line.endswith("errors are 3.2 times those of the worst sound robot, row by row, 0.8 times when corrected")
+
+
+def test_of_two_mappings_a_comment_says_which_one_a_program_uses(capsys):
+    swap = Correction("actions", "order", "", order=(1, 0, 2))
+    mapping = build_mapping([], [swap], {"q": 3}, ARM)
+    show(make_diagnosis(Answers(0.0, 0.0, {}, (1.0, 1.0)), mapping, [make_finding(0.9, 900.0, 3)]), None)
+    printed = capsys.readouterr().out
+    before, after = printed.split("# the same for a program that sends targets of joints; it does not apply `actions`")
+    assert "actions:" in before
+    assert after.strip().startswith("targets:")
