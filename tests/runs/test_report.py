@@ -225,6 +225,23 @@ def test_runs_in_folders_named_by_time_have_the_name_of_their_algorithm(write_ru
     assert sorted(recipe.label for recipe in report.recipes) == ["a2c", "ppo"]
 
 
+def test_groups_named_by_time_have_the_name_of_the_setting_that_differs(write_run):
+    texts = []
+    for number, rate in enumerate((0.001, 0.01)):
+        texts.append(f"runs/reach/lr{number}/2026-01-01_00-00-0{number}_seeds")
+        for seed in range(2):
+            values = {"evals": [(1000, 0.5, 1.0)], "metrics": [(500, 0.5, 1.0)]}
+            folder = write_run(texts[-1].removeprefix("runs/") + f"/s{seed}", seed=seed, status="finished", **values)
+            RunDirectory(folder).write_recipe(resolve("reach", None, {"algo_kwargs": {"learning_rate": rate}}))
+    report = content.collect(texts)
+    assert [recipe.label for recipe in report.recipes] == ["learning_rate 0.001", "learning_rate 0.01"]
+
+
+def test_no_episodes_are_no_error_where_none_are_played(group):
+    assert "</svg>" in write(group[0], target=Path("curves.svg"), episodes=0)
+    assert "steps" in write(group[0], target=Path("table.csv"), episodes=0)
+
+
 def test_results_have_the_mean_of_seeds_and_name_the_unfinished(write_run):
     texts = write_two_recipes(write_run)
     table = write(*texts, form="table", target=Path("table.md"))
@@ -419,6 +436,9 @@ def test_maps_of_a_policy_are_a_picture():
     measured = make_measured([0.2, 0.5, 0.5, 1.0])
     assert plots.draw_maps(measured, "png").startswith(b"\x89PNG")
     assert plots.draw_maps(measured, "pdf").startswith(b"%PDF")
+    svg = plots.draw_maps(measured, "svg").decode()
+    assert ">20%</text>" in svg
+    assert "episodes in every cell" in svg
     with pytest.raises(UsageError, match=r"^map\.jpg: the name of a picture ends in \.png, \.svg or \.pdf$"):
         plots.choose_form(Path("map.jpg"))
 

@@ -203,7 +203,7 @@ class Doctor:
         of_inputs = None
         if inputs is not None and most:
             of_inputs = self._find_input_mistake(inputs, corrected, match, found, stuck)
-        if of_inputs is not None:
+        if inputs is not None and of_inputs is not None:
             corrected = self._correct_input(inputs, of_inputs.correction, signals, match)
             found = self._search(corrected, stuck, most - 1)
             findings.append(_make_finding(of_inputs, of_inputs.correction.describe()))

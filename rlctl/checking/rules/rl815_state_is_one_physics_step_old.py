@@ -1,4 +1,4 @@
-"""RL815: state is one physics step old."""
+"""RL815: state is one step old."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -29,7 +29,7 @@ from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
     "RL815",
-    "state is one physics step old",
+    "state is one step old",
     Severity.INFO,
     meaning="""
         An observation or a reward is computed from a state before the last step of the physics, and so is late
@@ -51,6 +51,8 @@ FORWARD = (
     "Call mujoco.mj_forward(model, data) after mj_step (mj_kinematics is enough for xpos and site_xpos) and before the "
     "observation and the reward are computed."
 )
+READ_MUJOCO = "Read after the last mj_step; call mujoco.mj_forward(model, data) before the observation and the reward are computed."
+READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., computeForwardKinematics=True)."
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
 EXACT = 2e-6  # relative; the last bits of float32 and of sums
 OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
@@ -61,10 +63,11 @@ LATE_LINK = 0.001  # [m]
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     yield from _find_late_links(watched.calls)
     for world in watched.worlds:
-        old = list(_find_old_elements(world))
+        fix = READ_BULLET if find_mujoco(watched.instance.env) is None else READ_MUJOCO
+        old = list(_find_old_elements(world, fix))
         yield from old
         if not old:
-            yield from _find_elements_of_last_look(world)
+            yield from _find_elements_of_last_look(world, fix)
 
 
 @judges_trials(RULE, place=10)
@@ -139,7 +142,7 @@ def _find_changed(plain: Sequence[Look], changed: Sequence[Look]) -> list[int]:
     return [] if pair is None else np.flatnonzero(pair[0][0] != pair[1][0]).tolist()
 
 
-def _find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
+def _find_old_elements(world: LoggedWorld, fix: str) -> Iterator[RuleFinding]:
     """Yield the elements of the observation that equal the state before the last step of the physics, not the present
     one; an element may have its episode's constant added, such as a goal."""
     logs = [log for log in world.logs if sum(before is not None for before in log.before[1:]) >= FEWEST_LOOKS]
@@ -156,10 +159,10 @@ def _find_old_elements(world: LoggedWorld) -> Iterator[RuleFinding]:
         if earlier.any() and not present.any():
             old[column] = names[int(earlier.argmax())]
     if old:
-        yield _describe_old(old, "before the last step of the physics, not of the present one")
+        yield _describe_old(old, "before the last step of the physics, not of the present one", fix)
 
 
-def _find_elements_of_last_look(world: LoggedWorld) -> Iterator[RuleFinding]:
+def _find_elements_of_last_look(world: LoggedWorld, fix: str) -> Iterator[RuleFinding]:
     """Yield the elements of the observation that equal the state at the observation before, whose present value is
     nowhere in the observation: else they are a history."""
     logs = [log for log in world.logs if len(log.observed) > FEWEST_LOOKS]
@@ -178,15 +181,15 @@ def _find_elements_of_last_look(world: LoggedWorld) -> Iterator[RuleFinding]:
     names, found = name_features(logs[0]), zip(columns, only_earlier, strict=True)
     old = {column: names[int(row.argmax())] for column, row in found if row.any()}
     if old:
-        yield _describe_old(old, "before the whole step, not of the one after it")
+        yield _describe_old(old, "before the whole step, not of the one after it", fix)
 
 
-def _describe_old(old: Mapping[int, str], when: str) -> RuleFinding:
+def _describe_old(old: Mapping[int, str], when: str, fix: str) -> RuleFinding:
     elements = [f"observation[{column}] ({name})" for column, name in old.items()]
     verb = "is" if len(elements) == 1 else "are"
     message = f"{list_names(elements, 4)} {verb} of the state {when}"
     evidence = {"element": f"observation[{next(iter(old))}]", "elements": [f"observation[{c}]" for c in old][:8]}
-    return RuleFinding(RULE, message, evidence, Severity.WARNING)
+    return RuleFinding(RULE, message, evidence, Severity.WARNING, fix=fix)
 
 
 def _read_log(log: WorldLog) -> tuple[Array, Array, Array]:
@@ -215,4 +218,6 @@ def _find_late_links(calls: BulletCalls) -> Iterator[RuleFinding]:
     call = max(calls.late_links, key=lambda call: calls.late_links[call], default=None)
     if call is not None and (distance := calls.late_links[call]) > LATE_LINK:
         message = f"getLinkState returns the position before the last physics step: up to {1e3 * distance:.3g} mm away"
-        yield RuleFinding(RULE, message, {"value": distance, "expected": 0.0}, where=(call.file, call.line))
+        yield RuleFinding(
+            RULE, message, {"value": distance, "expected": 0.0}, where=(call.file, call.line), fix=READ_BULLET
+        )

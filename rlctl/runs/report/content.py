@@ -135,11 +135,14 @@ def _group_by_recipe(runs: Sequence[RunDescription], arguments: Mapping[Path, st
 
 
 def _find_argument(runs: Sequence[RunDescription], arguments: Mapping[Path, str]) -> str:
-    """Return the last part of the argument that named all runs; empty for several, globs and `latest`."""
+    """Return the last part of the argument that named all runs; empty for several, globs, `latest`, times."""
     texts = {arguments[run.run.path.resolve()] for run in runs}
     text = texts.pop()
     is_pattern = any(character in text for character in "*?[")
-    return "" if texts or is_pattern or text == "latest" else Path(text).resolve().name
+    name = Path(text).resolve().name
+    is_time = len(runs) > 1 and _TIME.match(name)  # of a group; a single run is known by its name
+    is_name = not (texts or is_pattern or text == "latest" or is_time)
+    return name if is_name else ""
 
 
 def _find_folder(runs: Sequence[RunDescription]) -> str:

@@ -14,6 +14,8 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, PercentFormatter
 from numpy.typing import NDArray
 
@@ -143,7 +145,8 @@ def choose_form(path: Path) -> Picture:
 
 def draw_maps(result: Robustness, form: Picture) -> bytes:
     """Return the robustness maps of a policy, next to each other, as a picture."""
-    return _draw_panels([functools.partial(_draw_map, varied=varied) for varied in result.maps], form)
+    title = f"{result.task}: {Path(result.policy_file).name}, {result.episodes:,} episodes in every cell"
+    return _draw_panels([functools.partial(_draw_map, varied=varied) for varied in result.maps], form, title)
 
 
 def draw_differences(result: MapComparison, form: Picture) -> bytes:
@@ -152,9 +155,11 @@ def draw_differences(result: MapComparison, form: Picture) -> bytes:
     return _draw_panels(panels, form)
 
 
-def _draw_panels(panels: Sequence[Callable[[Figure, Axes], None]], form: Picture) -> bytes:
+def _draw_panels(panels: Sequence[Callable[[Figure, Axes], None]], form: Picture, title: str = "") -> bytes:
     with matplotlib.rc_context(_STYLE):
         figure, file = Figure(figsize=(len(panels) * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
+        if title:
+            figure.suptitle(textwrap.fill(title, 60 * len(panels)), fontsize=9)
         for draw, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
             draw(figure, axes)
         _save(figure, file, form)
@@ -178,8 +183,9 @@ def _draw_difference(figure: Figure, axes: Axes, names: tuple[str, str], compare
     largest = 1.0 if compared.has_success else float(np.abs(values).max()) or 1.0
     limits = {"cmap": "RdYlGn", "vmin": -largest, "vmax": largest}
     _draw_heat(figure, axes, values, (rows, columns), unit, limits, "{x:+.0%}" if compared.has_success else None)
-    for index in np.flatnonzero(clear):
-        axes.plot(index % len(columns.values), index // len(columns.values), marker="*", ms=6, color="black")
+    for index in np.flatnonzero(clear):  # above the number of the cell
+        place = index % len(columns.values), index // len(columns.values) + 0.3
+        axes.plot(*place, marker="*", ms=6, color="black")
     _label(axes, columns.name, rows.name, title)
 
 
@@ -197,7 +203,8 @@ def _draw_learning(axes: Axes, curves: Sequence[_Curves], column: str, *, for_pa
             _draw_curve(axes, evaluated, label if name else "evaluations", {"marker": "o", "ms": 3, **line})
     if column == "success":
         _scale_rates(axes)
-    axes.legend(loc="best", **_LEGEND) if axes.lines else None
+    if axes.lines:  # below the axes, where it hides no curve
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, **_LEGEND)
     _label(axes, "training steps", _UNITS[column], f"{_TITLES[column]} over training steps")
     return bool(axes.lines)
 
@@ -266,8 +273,8 @@ def _draw_map(figure: Figure, axes: Axes, varied: RobustnessMap) -> None:
     _draw_heat(figure, axes, values, (rows, columns), _UNITS[quantity], {"cmap": "viridis", **limits}, form)
     for index, cell in enumerate(varied.cells):
         if cell.nominal:
-            place = index % len(columns.values), index // len(columns.values)
-            axes.plot(*place, marker="s", ms=9, mfc="none", mec="white", mew=1.5)
+            corner = index % len(columns.values) - 0.46, index // len(columns.values) - 0.46
+            axes.add_patch(Rectangle(corner, 0.92, 0.92, fill=False, edgecolor="white", linewidth=1.5))
     _label(axes, columns.name, rows.name, f"{_TITLES[quantity]} by {rows.name} and {columns.name}")
 
 
@@ -287,7 +294,19 @@ def _draw_heat(
     image = axes.imshow(grid, origin="lower", aspect="auto", **limits)
     axes.set_xticks(range(len(columns.values)), [f"{value:g}" for value in columns.values])
     axes.set_yticks(range(len(rows.values)), [f"{value:g}" for value in rows.values])
+    _write_cells(axes, image, grid, form or "{x:.3g}")
     figure.colorbar(image, ax=axes, label=unit, format=form)
+
+
+def _write_cells(axes: Axes, image: AxesImage, grid: NDArray[np.float64], form: str) -> None:
+    """Write the value of each cell in it, black on light colours; nothing where the environment failed."""
+    for (row, column), value in np.ndenumerate(grid):
+        if math.isnan(value):
+            continue
+        red, green, blue, _ = image.to_rgba(value)
+        is_light = 0.299 * red + 0.587 * green + 0.114 * blue > 0.5
+        color = "black" if is_light else "white"
+        axes.text(column, row, form.format(x=value), ha="center", va="center", fontsize=7, color=color)
 
 
 def _draw_varied(axes: Axes, result: RobustnessMap, quantity: str) -> None:

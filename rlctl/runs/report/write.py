@@ -78,7 +78,7 @@ def _refuse_options(form: Form, *, pictures: bool, episodes: int | None, labels:
     ignored = []
     if not pictures and form != "html":
         ignored.append("--no-pictures")
-    if episodes is not None and form not in ("html", "md"):
+    if episodes and form not in ("html", "md"):
         ignored.append("--episodes")
     if labels and form == "md":
         ignored.append("--label")
