@@ -24,6 +24,9 @@ class CommandCounts:
     first_problem: str = ""  # of them
     robot_late_s: list[float] = dataclasses.field(default_factory=list)
     """How much later than its time the robot itself began each step of `--realtime` [s]."""
+    terminated: int = 0  # episodes that the task ended, such as because the robot fell
+    tilted: int | None = None
+    """Episodes at whose end the trunk was not upright, by the task's term `gravity`; None without that term."""
     compared: int = 0
     differences: list[CommandDifference] = dataclasses.field(default_factory=list)
 

@@ -22,6 +22,7 @@ from rlctl_robot.robot.program import Arrival, ControlProgram, SentObservation
 _RESEND_S = 0.25  # after which an observation that is not answered is sent again: a UDP packet may be lost
 
 
+_UPRIGHT = -0.5  # component z of the direction of gravity in the trunk's frame: a tilt of 60 degrees
 _ROW = np.zeros(1, np.int64)
 
 
@@ -89,6 +90,7 @@ class RobotPlayer:
         while True:
             step = self._step
             measured = self._interface.measure(take_row(observations, 0))
+            before = take_row(observations, 0)
             command = await self._exchange(measured, step)
             self._counts.held += command is None
             newest = newest if command is None else command
@@ -98,11 +100,23 @@ class RobotPlayer:
             observations = result.observation
             if result.terminated[0] or result.truncated[0]:
                 self._counts.unanswered += len(self._waiting)
+                self._count_end(before, bool(result.terminated[0]))
                 return self._summarize()
 
     @property
     def _step(self) -> int:
         return int(self._worlds.step_of[0])
+
+    def _count_end(self, observed: Any, is_terminated: bool) -> None:
+        """Count how an episode ended; `observed` is its last observation but one."""
+        self._counts.terminated += is_terminated
+        sizes = self._info.observation_sizes
+        if sizes.get("gravity") != 3 or not isinstance(observed, np.ndarray):
+            return
+        names = list(sizes)
+        start = sum(sizes[name] for name in names[: names.index("gravity")])
+        is_tilted = float(observed[start + 2]) > _UPRIGHT
+        self._counts.tilted = (self._counts.tilted or 0) + is_tilted
 
     def _summarize(self) -> EpisodeResult:
         totals = self._worlds.totals(0)

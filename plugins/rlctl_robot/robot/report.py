@@ -40,12 +40,26 @@ def show(report: RobotReport, json: str | None, gates: Gates) -> None:
     output.print_table(columns, [_list_scores(score) for score in report.scores], left=("",))
     _show_times(report)
     _show_differences(report)
+    if report.scores[0].outcome.success_rate == 0:
+        out.print(describe_failures(report.scores[0]), soft_wrap=True)
     for score in report.scores:
         if score.commands.refused:
             out.print(
                 f"{_name(score)}: {score.commands.refused:,} messages were no command, the first: "
                 f"{score.commands.first_problem}"
             )
+
+
+def describe_failures(score: FaultScore) -> str:
+    """Return how the episodes of a program without any success ended, and what searches for the cause."""
+    counts, episodes = score.commands, len(score.episodes)
+    if counts.tilted is not None:
+        how = f"the robot was not upright at the end of {counts.tilted} of {episodes}"
+    elif counts.terminated:
+        how = f"the task ended {counts.terminated} of {episodes} early, such as after a fall"
+    else:
+        how = "none ended early"
+    return f"no episode succeeded: {how}; rlctl diagnose LOG searches your program's log for the cause"
 
 
 def _name(score: FaultScore) -> str:

@@ -51,7 +51,7 @@ FORWARD = (
     "Call mujoco.mj_forward(model, data) after mj_step (mj_kinematics is enough for xpos and site_xpos) and before the "
     "observation and the reward are computed."
 )
-READ_MUJOCO = "Read after the last mj_step; call mujoco.mj_forward(model, data) before the observation and the reward are computed."
+READ_MUJOCO = "Read after the last mj_step; then call mujoco.mj_forward(model, data) for what follows from positions."
 READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., computeForwardKinematics=True)."
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
 EXACT = 2e-6  # relative; the last bits of float32 and of sums

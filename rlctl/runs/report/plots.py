@@ -303,7 +303,7 @@ def _write_cells(axes: Axes, image: AxesImage, grid: NDArray[np.float64], form: 
     for (row, column), value in np.ndenumerate(grid):
         if math.isnan(value):
             continue
-        red, green, blue, _ = image.to_rgba(value)
+        red, green, blue, _ = image.to_rgba(np.array([value]))[0]
         is_light = 0.299 * red + 0.587 * green + 0.114 * blue > 0.5
         color = "black" if is_light else "white"
         axes.text(column, row, form.format(x=value), ha="center", va="center", fontsize=7, color=color)

@@ -16,7 +16,7 @@ from rlctl.evaluation.eval_request import NO_GATES, Gates
 from rlctl.limits.limits import Limits
 from rlctl_robot.robot import packets
 from rlctl_robot.robot.packets import Kind, Packet
-from rlctl_robot.robot.report import as_json
+from rlctl_robot.robot.report import as_json, describe_failures
 from rlctl_robot.robot.robot import run_robot
 from rlctl_robot.robot.robot_request import RobotRequest
 from rlctl_robot.serve.session import Session, load_served_policy
@@ -61,6 +61,16 @@ def test_a_program_in_lock_step(program, act, name):
     report.check(Gates(min_success=1.0))
     with pytest.raises(AnswerIsNo, match=r"^gate missed: mean return -3.000 is below 0$"):
         report.check(Gates(min_return=0.0))
+
+
+def test_without_success_it_says_how_episodes_ended():
+    score = play(control_by_udp, lambda values: np.zeros(2, np.float32)).scores[0]
+    assert score.outcome.success_rate == 0
+    assert (score.commands.terminated, score.commands.tilted) == (0, None)
+    text = describe_failures(score)
+    assert text.startswith("no episode succeeded: none ended early; rlctl diagnose LOG searches")
+    score.commands.tilted = 1
+    assert "the robot was not upright at the end of 1 of 2;" in describe_failures(score)
 
 
 def write_policy(file, weight, frames=1, task=SLIDER):
