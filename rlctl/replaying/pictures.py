@@ -39,9 +39,9 @@ from rlctl.task import Sim
 from rlctl.task.env import TaskEnv
 
 Kept = TypeVar("Kept")
-_SIZE = {".mp4": (640, 480), ".gif": (400, 300)}  # [pixels], of a film
+_SIZE = {".mp4": (640, 480), ".gif": (400, 300), ".png": (640, 480)}  # [pixels], of a film or a picture
 _SMALLEST, _LARGEST = 64, 3840  # [pixels], of a side of a film
-_RATE = {".mp4": 30.0, ".gif": 20.0}  # [1/s], at most
+_RATE = {".mp4": 30.0, ".gif": 20.0, ".png": 30.0}  # [1/s], at most
 _PAUSE_S = 0.5  # [s] at the end of each episode
 _STRIP_SIZE = (240, 180)  # [pixels], of a report's pictures
 
@@ -102,7 +102,7 @@ def read_size(text: str | None) -> tuple[int, int] | None:
 def check_file(path: Path) -> None:
     """Raise `UsageError` for a file that is not a film, or if the package that encodes it is not installed."""
     if path.suffix not in _SIZE:
-        raise UsageError(f"--video {path}: give a file that ends in .mp4 or .gif")
+        raise UsageError(f"--video {path}: give a file that ends in .mp4 or .gif, or .png for one picture")
     if path.suffix == ".mp4":
         try:
             import av  # noqa: F401
@@ -124,6 +124,7 @@ def film_episodes(
     viewpoint: Viewpoint | None = None,
     size: tuple[int, int] | None = None,
     draw: Warn | None = None,
+    at_s: float | None = None,
 ) -> tuple[list[Kept], FilmReport]:
     """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step.
 
@@ -131,12 +132,20 @@ def film_episodes(
     large, and is forgotten before the next one. `size` is width and height [pixels], by default that of the kind of
     file. With `draw` the rollouts have scenes, as in `play_episode`. Raises `UsageError` for an environment that makes
     no pictures, or none of that size.
+
+    A `.png` is one picture of the only episode, `at_s` [s] after its start, by default in its middle. Raises
+    `UsageError` for a time that the episode does not reach.
     """
+    still = None
+    if path.suffix == ".png":
+        # The length of an episode is known after it: it is played once more, and drawn at one step only.
+        rollout = play_episode(env, spec, seeds[0], begin(seeds[0]), policy=policy)
+        still = _choose_step(len(rollout.episode.actions), find_dt(env) or DEFAULT_DT, at_s)
     kept: list[Kept] = []
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
-        film = _Film(env, part, viewpoint, size)
+        film = _Film(env, part, viewpoint, size, still)
         both = join_watches(watch, film.watch)
         for number, seed in enumerate(seeds):
             kept.append(keep(number, play_episode(env, spec, seed, begin(seed), policy=policy, watch=both, draw=draw)))
@@ -149,8 +158,27 @@ def film_episodes(
     return kept, reports[0]
 
 
+def _choose_step(steps: int, dt: float, at_s: float | None) -> int:
+    """Return the step of an episode at a time, or in its middle."""
+    if at_s is None:
+        return steps // 2
+    step = round(at_s / dt)
+    if step > steps:
+        raise UsageError(f"--at {at_s:g}: the episode ends after {steps * dt:.4g} s")
+    return step
+
+
 class _Film:
-    def __init__(self, env: Env, path: Path, viewpoint: Viewpoint | None, size: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        env: Env,
+        path: Path,
+        viewpoint: Viewpoint | None,
+        size: tuple[int, int] | None = None,
+        still: int | None = None,
+    ) -> None:
+        """With `still` only this step is drawn."""
+        self._still = still
         self._size = size
         self._view = look_at(env, *(size or _SIZE[path.suffix]), viewpoint)
         inner = env.unwrapped
@@ -161,14 +189,14 @@ class _Film:
         self._rate = 1 / (dt * self._every)
         self._count, self._seconds = 0, 0.0
         self._is_taken = False
-        self.writer = (_Mp4 if path.suffix == ".mp4" else _Gif)(path, self._rate)
+        self.writer = _WRITERS[path.suffix](path, self._rate)
 
     def watch(self, step: int) -> None:
         """Take a picture after the reset and after every n-th step."""
         self._step = step
         if step == 0:
             self._begin()
-        self._is_taken = step % self._every == 0
+        self._is_taken = step == self._still if self._still is not None else step % self._every == 0
         if self._is_taken:
             self._take()
 
@@ -193,6 +221,8 @@ class _Film:
 
     def pause(self) -> None:
         """Take the last picture of an episode and show it for a moment."""
+        if self._still is not None:
+            return
         if not self._is_taken:
             self._take()
         for _ in range(round(_PAUSE_S * self._rate)):
@@ -241,3 +271,21 @@ class _Gif:
     def close(self) -> None:
         first, *rest = self._pictures
         first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)
+
+
+class _Png:
+    """One picture, written by Pillow."""
+
+    def __init__(self, path: Path, rate: float) -> None:
+        self._path = path
+
+    def add(self, picture: Picture) -> None:
+        from PIL import Image
+
+        Image.fromarray(picture).save(self._path, format="PNG")
+
+    def close(self) -> None:
+        """It is written already."""
+
+
+_WRITERS: dict[str, type[_Mp4] | type[_Gif] | type[_Png]] = {".mp4": _Mp4, ".gif": _Gif, ".png": _Png}

@@ -58,6 +58,7 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
                 viewpoint=viewpoint,
                 size=size,
                 draw=draw,
+                at_s=request.at,
             )
     elif request.gui and seeds:
         with closing(open_window(spec)) as env:
@@ -92,7 +93,7 @@ def _check_request(request: ReplayRequest) -> None:
     for names in (*outputs, ("worst", "best", "failures")):
         if len(given := [f"--{name}" for name in names if getattr(request, name)]) > 1:
             raise UsageError(f"{given[0]} and {given[1]} exclude each other: leave out {given[1]}")
-    for name in ("camera", "size"):
+    for name in ("camera", "size", "at"):
         if getattr(request, name) is not None and request.video is None:
             raise UsageError(f"--{name} is for films: add --video FILE.mp4")
     if request.verify is not None and source is not None:
@@ -107,6 +108,7 @@ def _check_request(request: ReplayRequest) -> None:
         )
     if request.video is not None:
         check_file(request.video)
+        _check_picture(request, request.video)
     if target is None:
         return
     count = request.choice.count if request.choice else request.episodes or 1
@@ -114,6 +116,15 @@ def _check_request(request: ReplayRequest) -> None:
         raise UsageError(f"--output {target}: a recording has one episode; give a folder for {count}")
     if target.suffix != ".rrd" and target.is_file():
         raise UsageError(f"--output {target}: give a folder, or the name of a recording, which ends in .rrd")
+
+
+def _check_picture(request: ReplayRequest, video: Path) -> None:
+    count = request.choice.count if request.choice else request.episodes or 1
+    is_picture = video.suffix == ".png"
+    if request.at is not None and not is_picture:
+        raise UsageError("--at is for one picture: add --video FILE.png")
+    if is_picture and (count or 1) > 1:
+        raise UsageError(f"--video {video}: a picture is of one episode: leave out --episodes")
 
 
 def _check_baseline(request: ReplayRequest, policy: str) -> None:

@@ -59,7 +59,12 @@ class ReplayRequest:
         ),
     ] = None
     video: Annotated[
-        Path | None, Option("Write a film, .mp4 or .gif; recordings too only with --output.", metavar="FILE")
+        Path | None,
+        Option("Write a film, .mp4 or .gif, or a picture, .png; recordings too only with --output.", metavar="FILE"),
+    ] = None
+    at: Annotated[
+        float | None,
+        Option("Of a .png: seconds after the start.", metavar="SECONDS", min=0, default_text="the middle"),
     ] = None
     size: Annotated[
         str | None,

@@ -107,7 +107,7 @@ def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
             "x.npz is a recorded episode and is replayed unchanged: leave out --worst",
         ),
         (["--worst", "2", "-o", "y.rrd"], "--output y.rrd: a recording has one episode; give a folder for 2"),
-        (["--video", "y.avi"], "--video y.avi: give a file that ends in .mp4 or .gif"),
+        (["--video", "y.avi"], "--video y.avi: give a file that ends in .mp4 or .gif, or .png for one picture"),
     ],
 )
 def test_bad_requests(replay, arguments, message):

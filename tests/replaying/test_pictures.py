@@ -187,3 +187,14 @@ def test_steps_of_episodes_that_end_early_count_as_whole_ones():
     for step in (0, 1, 2, 0, 1):
         watch(step)
     assert shown == [0, 1, 2, 10, 11]
+
+
+def test_one_picture_of_an_episode(short_episode, tmp_path):
+    film = run_replay(ReplayRequest(str(short_episode), video=tmp_path / "still.png", size="320x240", at=0.0)).film
+    assert (film.pictures, film.width, film.height) == (1, 320, 240)
+    assert (tmp_path / "still.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(UsageError, match=r"^--at 900: the episode ends after"):
+        run_replay(ReplayRequest(str(short_episode), video=tmp_path / "late.png", at=900.0))
+    assert not (tmp_path / "late.png").exists()
+    with pytest.raises(UsageError, match=r"^--at is for one picture: add --video FILE\.png$"):
+        run_replay(ReplayRequest(str(short_episode), video=tmp_path / "film.gif", at=1.0))
