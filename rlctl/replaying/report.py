@@ -78,10 +78,10 @@ def show(result: ReplayResult, json: str | None) -> None:
         out.print(_format_episode(episode))
     if film := result.film:
         if film.file.suffix == ".png":
-            out.print(f"{film.file}: a picture of {film.width}x{film.height}", soft_wrap=True)
-            return
-        pictures = f"{film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second"
-        out.print(f"{film.file}: {pictures}; drawn at {film.drawn_per_s:.3g} per second")
+            out.print(f"{film.file}: a picture of {film.width}x{film.height}")
+        else:
+            pictures = f"{film.pictures} pictures of {film.width}x{film.height}, {film.rate:.3g} per second"
+            out.print(f"{film.file}: {pictures}; drawn at {film.drawn_per_s:.3g} per second")
     if command := open_command(result):
         out.print(f"open with: {command}")
         out.print(f"without a display, in a browser: {command.replace('rerun', 'rerun --serve-web', 1)}")

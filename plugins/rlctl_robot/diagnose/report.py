@@ -5,6 +5,7 @@ import dataclasses
 from rlctl import output
 from rlctl.storage import yaml_text
 from rlctl_robot.diagnose.diagnose import Answers, Diagnosis
+from rlctl_robot.diagnose.mapping import CorrectedMapping
 from rlctl_robot.diagnose.policy_match import SAME
 
 _ODD = 1.6  # times the usual error, from which an observation is listed
@@ -39,14 +40,19 @@ def show(result: Diagnosis, json: str | None) -> None:
             out.print(f"- {finding.describe()}", soft_wrap=True)
     if mapping:
         out.print("\nthe corrected mapping, corrected = sign * scale * value[order] + offset:")
-        targets = mapping.pop("targets", None)
-        if mapping:
-            out.print(yaml_text.dump(mapping), end="", soft_wrap=True)
-        if targets is not None:
-            if "actions" in mapping:
-                note = "# the same for a program that sends targets of joints; it does not apply `actions`"
-                out.print(note, soft_wrap=True)
-            out.print(yaml_text.dump({"targets": targets}), end="", soft_wrap=True)
+        out.print(describe_mapping(result.mapping), end="", soft_wrap=True)
+
+
+def describe_mapping(mapping: CorrectedMapping) -> str:
+    """Return the mapping as YAML; of `actions` and `targets` a comment says which one a program uses."""
+    content = mapping.model_dump(exclude_defaults=True)
+    targets = content.pop("targets", None)
+    text = yaml_text.dump(content) if content else ""
+    if targets is None:
+        return text
+    if "actions" in content:
+        text += "# the same for a program that sends targets of joints; it does not apply `actions`\n"
+    return text + yaml_text.dump({"targets": targets})
 
 
 def _describe_difference(answers: Answers) -> str:

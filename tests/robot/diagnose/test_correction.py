@@ -19,7 +19,7 @@ from rlctl_robot.diagnose.diagnose import (
     _mark_weak,
 )
 from rlctl_robot.diagnose.mapping import build_mapping, compose, invert
-from rlctl_robot.diagnose.report import describe_answers, show
+from rlctl_robot.diagnose.report import describe_answers, describe_mapping
 from rlctl_robot.diagnose.signals import LoggedSignals, shift
 
 ARM = Joints(["a", "b", "c"], default_positions=[0.1, 0.5, 0.0], action_scale=[0.2, 0.4, 1.0], measured="q")
@@ -218,12 +218,9 @@ def test_what_decided_is_what_is_printed():
     assert line.endswith("errors are 3.2 times those of the worst sound robot, row by row, 0.8 times when corrected")
 
 
-def test_of_two_mappings_a_comment_says_which_one_a_program_uses(capfd):
+def test_of_two_mappings_a_comment_says_which_one_a_program_uses():
     swap = Correction("actions", "order", "", order=(1, 0, 2))
-    mapping = build_mapping([], [swap], {"q": 3}, ARM)
-    show(make_diagnosis(Answers(0.0, 0.0, {}, (1.0, 1.0)), mapping, [make_finding(0.9, 900.0, 3)]), None)
-    printed = capfd.readouterr().out
-    before, after = printed.split("# the same for a program that sends targets of joints;")
-    after = after.partition("\n")[2]
-    assert "actions:" in before
-    assert after.strip().startswith("targets:")
+    text = describe_mapping(build_mapping([], [swap], {"q": 3}, ARM))
+    before, after = text.split("# the same for a program that sends targets of joints; it does not apply `actions`\n")
+    assert before == "actions:\n  order: [1, 0, 2]\n"
+    assert after.startswith("targets:\n  order: [1, 0, 2]\n")
