@@ -204,7 +204,7 @@ def _draw_learning(axes: Axes, curves: Sequence[_Curves], column: str, *, for_pa
     if column == "success":
         _scale_rates(axes)
     if axes.lines:  # below the axes, where it hides no curve
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, **_LEGEND)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, **_LEGEND)
     _label(axes, "training steps", _UNITS[column], f"{_TITLES[column]} over training steps")
     return bool(axes.lines)
 
