@@ -116,3 +116,10 @@ def test_rules_that_compare_repeated_episodes_say_why_they_could_not():
     verdict = judge(records_of("broken_mujoco.py:ArmOldTipAtRandom", "build", "worlds"), ["RL815"])
     assert verdict.judged == []
     assert verdict.not_judged == {"RL815": "an episode with the same seed and actions is not the same again (RL302)"}
+
+
+def test_a_fix_names_the_calls_of_the_own_engine():
+    [finding] = findings("broken_mujoco.py:RL815HopperStateInTheLoop", "RL815")
+    assert "mj_forward" in finding.fix
+    assert "getLinkState" not in finding.fix
+    assert finding.name == "state is one step old"
