@@ -10,7 +10,11 @@ from rlctl.recipe.recipe import ALGORITHMS, SCHEMA_FILE
 from rlctl.storage import yaml_text
 
 ROOT = Path(__file__).parents[2]
-RECIPES = [*ROOT.glob("plugins/*/*.yaml"), *ROOT.glob("rlctl/recipe/presets/*.yaml"), *ROOT.glob("examples/*/*.yaml")]
+RECIPES = [
+    *ROOT.glob("plugins/*/*.yaml"),
+    *ROOT.glob("rlctl/recipe/presets/*.yaml"),
+    *(file for file in ROOT.glob("examples/*/*.yaml") if file.name != "limits.yaml"),
+]
 VALIDATOR = jsonschema.Draft7Validator(json.loads(SCHEMA_FILE.read_text()))
 
 

@@ -74,7 +74,7 @@ def _check_form(graph: onnx.GraphProto, constants: dict[str, Any]) -> None:
     if len(inputs) != 1:
         hint = ""
         if "time_step" in names:
-            hint = "; it plays a motion, and rlctl imports policies that follow velocity commands"
+            hint = "; it plays a motion, and only policies that follow velocity commands are imported"
         raise NotImportable(f"its graph has {len(inputs)} inputs ({names}), expected one: the observation{hint}")
     shape = [dimension.dim_value or 0 for dimension in inputs[0].type.tensor_type.shape.dim]
     if len(shape) not in (1, 2):
@@ -155,7 +155,7 @@ class _ChainReader:
                 return [("first", int(sizes[0]))]
             return [("part", len(node.output))]
         raise NotImportable(
-            f"its graph has the operator {kind}; rlctl imports perceptrons: linear layers, factors and shifts, "
+            f"its graph has the operator {kind}; only perceptrons are imported: linear layers, factors and shifts, "
             f"{', '.join(ACTIVATIONS)}"
         )
 

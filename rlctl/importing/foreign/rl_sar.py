@@ -88,7 +88,7 @@ def _read_base(config: Path, robot: str) -> dict[str, Any]:
 
 
 def _read_term(name: str, config: Mapping[str, Any], history: int, source: str) -> dict[str, Any]:
-    check_name(name, _TERMS, f"{source}: no observation of rlctl is", UsageError, listed="It knows")
+    check_name(name, _TERMS, f"{source}: no known observation is", UsageError, listed="It knows")
     part: dict[str, Any] = {"kind": _TERMS[name], "history": history}
     scale = config.get(_SCALES.get(name, ""), 1.0)
     wheels = config.get("wheel_indices") or []

@@ -109,7 +109,7 @@ def _list_layers(module: Module) -> list[Layer]:
                 raise NotImportable("its ELU has an alpha other than 1")
             layers.append((_ACTIVATIONS[kind], None))
         elif kind != "Identity":
-            raise NotImportable(f"its perceptron has a {kind}; rlctl imports Linear, {', '.join(_ACTIVATIONS)}")
+            raise NotImportable(f"its perceptron has a {kind}; those of perceptrons are Linear, {', '.join(_ACTIVATIONS)}")
     return layers
 
 
@@ -121,7 +121,7 @@ def _read_number(name: str) -> int:
 
 def _read_lstm(module: Module) -> ForeignLstm:
     if _find_class(module) != "LSTM":
-        raise NotImportable(f"its recurrent part is a {_find_class(module)}; rlctl imports LSTM")
+        raise NotImportable(f"its recurrent part is a {_find_class(module)}; only LSTM is imported")
     layers: list[tuple[Array, Array, Array, Array]] = []
     while f"weight_ih_l{len(layers)}" in module.tensors:
         number = len(layers)
@@ -138,6 +138,6 @@ def _standardize(first: ForeignLinear, module: Module) -> ForeignLinear:
     tensors = module.tensors
     mean, std = tensors.get("_mean"), tensors.get("_std")
     if mean is None or std is None:
-        raise NotImportable(f"its normaliser is a {_find_class(module)}; rlctl knows those with _mean and _std")
+        raise NotImportable(f"its normaliser is a {_find_class(module)}; those with _mean and _std are known")
     epsilon = float(module.values.get("eps", 0.0))
     return first.standardize(np.ravel(mean).astype(float), 1.0 / (np.ravel(std).astype(float) + epsilon))

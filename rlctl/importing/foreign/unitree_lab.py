@@ -75,7 +75,7 @@ def _order_motors(robot: Robot, draft: Draft) -> Sequence[str]:
 def _read_action(actions: Mapping[str, Any], default: Any, source: str, draft: Draft) -> None:
     check = list(actions)
     if check != [_POSITION]:
-        raise UsageError(f"{source}: actions are {', '.join(check) or 'missing'}; rlctl imports {_POSITION}")
+        raise UsageError(f"{source}: actions are {', '.join(check) or 'missing'}; only {_POSITION} is imported")
     action = actions[_POSITION]
     if isinstance(action.get("joint_ids"), list) and None not in action["joint_ids"]:
         raise UsageError(f"{source}: the actions move some joints only, which rlctl does not import")
@@ -90,9 +90,9 @@ def read_term(name: str, term: Mapping[str, Any], source: str) -> dict[str, Any]
     """Return an observation of Isaac Lab; raises `UsageError` for one that rlctl does not know."""
     if "motion" in name or "anchor" in name:
         raise UsageError(
-            f"{source}: observes {name}: it tracks a motion, and rlctl imports policies that follow velocity commands"
+            f"{source}: observes {name}: it tracks a motion, and only policies that follow velocity commands are imported"
         )
-    check_name(name, TERMS, f"{source}: no observation of rlctl is", UsageError, listed="It knows")
+    check_name(name, TERMS, f"{source}: no known observation is", UsageError, listed="It knows")
     part: dict[str, Any] = {"kind": TERMS[name], "history": max(1, term.get("history_length") or 1)}
     if term.get("scale") is not None:
         part["scale"] = shorten(term["scale"])

@@ -190,7 +190,7 @@ def test_columns_of_histories():
         (describe_walk(stiffness=None), 45, None, "does not say: stiffness. Give --set stiffness=40"),
         (GYM, 47, {"stifness": 1}, "a deployment has no 'stifness'. Did you mean 'stiffness'"),
         (LAB | {"observations": {"motion_command": {}}}, 48, None, "it tracks a motion"),
-        (LAB | {"observations": {"height_scan": {}}}, 48, None, "no observation of rlctl is 'height_scan'"),
+        (LAB | {"observations": {"height_scan": {}}}, 48, None, "no known observation is 'height_scan'"),
         (LAB | {"joint_ids_map": [99] * 12}, 48, None, "joint_ids_map has the index 99, and there are 12 values"),
         ({"a": 1}, 45, None, "in none of the known forms"),
     ],
