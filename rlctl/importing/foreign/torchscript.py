@@ -109,7 +109,7 @@ def _list_layers(module: Module) -> list[Layer]:
                 raise NotImportable("its ELU has an alpha other than 1")
             layers.append((_ACTIVATIONS[kind], None))
         elif kind != "Identity":
-            raise NotImportable(f"its perceptron has a {kind}; those of perceptrons are Linear, {', '.join(_ACTIVATIONS)}")
+            raise NotImportable(f"its perceptron has a {kind}; known are Linear, {', '.join(_ACTIVATIONS)}")
     return layers
 
 

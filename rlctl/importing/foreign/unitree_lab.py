@@ -90,7 +90,7 @@ def read_term(name: str, term: Mapping[str, Any], source: str) -> dict[str, Any]
     """Return an observation of Isaac Lab; raises `UsageError` for one that rlctl does not know."""
     if "motion" in name or "anchor" in name:
         raise UsageError(
-            f"{source}: observes {name}: it tracks a motion, and only policies that follow velocity commands are imported"
+            f"{source}: observes {name}: it tracks a motion; only policies that follow velocity commands are imported"
         )
     check_name(name, TERMS, f"{source}: no known observation is", UsageError, listed="It knows")
     part: dict[str, Any] = {"kind": TERMS[name], "history": max(1, term.get("history_length") or 1)}
