@@ -91,23 +91,32 @@ class Scaled(Term):
 
 
 @dataclasses.dataclass(frozen=True)
-class Gravity(Term):
-    """Direction of gravity in a body's frame, shape (3,), from its orientation as a unit quaternion (x, y, z, w)."""
+class OrientationTerm(Term):
+    """A function of one body's orientation as a unit quaternion (x, y, z, w)."""
 
     orientation: str = "orientation"
-    kind: Literal["gravity"] = "gravity"
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """The orientation."""
         return (self.orientation,)
 
-    def compute(self, *quantities: Any) -> list[Any]:
-        """Return the third row of the rotation matrix, times -1."""
-        (orientation,) = quantities
+    def _split(self, orientation: Any) -> list[Any]:
+        """Return x, y, z and w, each of shape (..., 1)."""
         if orientation.shape[-1] != 4:
             raise ValueError(f"a quaternion of {orientation.shape[-1]} elements")
-        x, y, z, w = (orientation[..., index : index + 1] for index in range(4))
+        return [orientation[..., index : index + 1] for index in range(4)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gravity(OrientationTerm):
+    """Direction of gravity in a body's frame, shape (3,), from its orientation as a unit quaternion (x, y, z, w)."""
+
+    kind: Literal["gravity"] = "gravity"
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the third row of the rotation matrix, times -1."""
+        x, y, z, w = self._split(*quantities)
         # In the order of `rotate_inverse(orientation, (0, 0, -1))`, whose bits it has: 0.0 removes the sign of zeros.
         return [
             0.0 + w * (2.0 * y) - z * (2.0 * x),
@@ -117,23 +126,14 @@ class Gravity(Term):
 
 
 @dataclasses.dataclass(frozen=True)
-class Euler(Term):
+class Euler(OrientationTerm):
     """Roll, pitch and yaw [rad], shape (3,), from a body's orientation as a unit quaternion (x, y, z, w)."""
 
-    orientation: str = "orientation"
     kind: Literal["euler"] = "euler"
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The orientation."""
-        return (self.orientation,)
 
     def compute(self, *quantities: Any) -> list[Any]:
         """Return the angles about x, y and z."""
-        (orientation,) = quantities
-        if orientation.shape[-1] != 4:
-            raise ValueError(f"a quaternion of {orientation.shape[-1]} elements")
-        x, y, z, w = (orientation[..., index : index + 1] for index in range(4))
+        x, y, z, w = self._split(*quantities)
         sine = np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0)
         roll = _find_angle(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         yaw = _find_angle(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

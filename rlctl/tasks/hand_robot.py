@@ -19,7 +19,7 @@ from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.motors import ChosenMotors, choose_motors
 from rlctl.tasks.shapes import Array, Shapes
 from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
-from rlctl.tasks.starter_robot import StarterRobot, list_faults, name_robot
+from rlctl.tasks.starter_robot import StarterRobot, check_mounted, list_faults, name_robot
 from rlctl.tasks.surfaces import Surfaces
 from rlctl.tasks.tabletop import TableArea, find_table
 
@@ -129,9 +129,7 @@ def _load(path: Path, model: str) -> Linkage:
         body = sim.load("arm", path, fixed=True)
     except TaskError as error:
         raise UsageError(f"--model: {str(error).replace(str(path), model)}") from None
-    if not body.fixed or not body.joint_names:
-        what = "its base is free" if not body.fixed else "it has no joints"
-        raise UsageError(f"--model {model}: {what}; --pick, --place and --push are for an arm that is mounted")
+    check_mounted(body, model, "--pick, --place and --push are for an arm that is mounted")
     return Linkage(body)
 
 

@@ -111,10 +111,8 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
         body = sim.load("arm", path, fixed=True)
     except TaskError as error:
         raise UsageError(f"--model: {error}") from None
-    if not body.fixed or not body.joint_names:
-        what = "its base is free" if not body.fixed else "it has no joints"
-        legs = "" if body.fixed else "; for a robot with legs add --walk"
-        raise UsageError(f"--model {model}: {what}; this makes a task for an arm that is mounted{legs}")
+    legs = "" if body.fixed else "; for a robot with legs add --walk"
+    check_mounted(body, model, f"this makes a task for an arm that is mounted{legs}")
     arm = ArmModel(body)
     name = link if link is not None else arm.find_tip()
     check_name(name, [body.base_name, *body.link_names], f"--link: {path.name} has no link", UsageError)
@@ -132,6 +130,14 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
         _summarize(described, only_mujoco=only_mujoco),
         kept=frozenset(name for name, is_kept in kept.items() if is_kept),
     )
+
+
+def check_mounted(body: MujocoBody, model: str, advice: str) -> None:
+    """Raise `UsageError`, which ends in `advice`, for a body with a free base or without joints."""
+    if not body.fixed:
+        raise UsageError(f"--model {model}: its base is free; {advice}")
+    if not body.joint_names:
+        raise UsageError(f"--model {model}: it has no joints; {advice}")
 
 
 def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
