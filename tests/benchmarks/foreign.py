@@ -23,6 +23,7 @@ import yaml
 from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.importing.foreign.import_policy import ImportedPolicy, import_policy, make_policy, read_network
+from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.policy.load import check_playable
 from rlctl.task.deployment import Deployment
 from rlctl.task.mujoco.robot import Robot, read_robot
@@ -202,12 +203,12 @@ class Trials:
     def import_named(self, name: str) -> ImportedPolicy:
         """Return a policy as its files say."""
         files = self._policies[name]
-        deploy = Path(files["deploy"]) if "deploy" in files else None
+        deploy = None
+        if "deploy" in files:
+            deploy = Path(files["deploy"])
         return import_policy(
             Path(files["policy"]),
-            deploy,
-            str(files["model"]),
-            terrain=str(files.get("terrain", "")),
+            ForeignFiles(deploy, str(files["model"]), files.get("terrain")),
             settings=files.get("set"),
             output=self._folder / f"{name}.safetensors",
         )

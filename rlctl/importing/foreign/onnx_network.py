@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, short_repr
-from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork, Layer, NotImportable, assemble
+from rlctl.importing.foreign.network import LARGEST_FILE, ForeignLinear, ForeignNetwork, Layer, NotImportable, assemble
 from rlctl.policy.layers import ACTIVATIONS
 from rlctl.policy.onnx_policy import check, open_session
 from rlctl.storage import untrusted
@@ -27,7 +27,7 @@ _COMPARED, _TOLERANCE = 16, 1e-4  # random observations with which the network i
 
 def read_onnx(path: Path) -> tuple[ForeignNetwork, dict[str, str]]:
     """Return the network of a graph and the graph's metadata; raises `ArtifactError` for one that is not imported."""
-    content = untrusted.read_bytes(path)
+    content = untrusted.read_bytes(path, LARGEST_FILE)
     try:
         check(content)
         network, metadata = _read(content)

@@ -112,6 +112,57 @@ def test_torchscript_that_does_more_is_refused_with_the_way_to_onnx(tmp_path):
         read_torchscript_network(tmp_path / "a.pt")
 
 
+def write_graph(path, *, skips=False):
+    """Write a perceptron as torch.fx makes it of an ONNX file: a graph whose parts are called one after the other."""
+    torch.manual_seed(0)
+    parts = {"a/0/Gemm": torch.nn.Linear(5, 4), "a/1/Elu": torch.nn.ELU(), "a/2/Gemm": torch.nn.Linear(4, 2)}
+    graph = torch.fx.Graph()
+    value = graph.placeholder("input_1")
+    for name in parts:
+        value = graph.call_module(name, (value,))
+    if skips:
+        value = graph.call_method("neg", (value,))
+    graph.output(value)
+    module = torch.fx.GraphModule(parts, graph)
+    torch.jit.script(module).save(str(path))
+    return module
+
+
+def test_torchscript_of_a_graph_is_a_chain_of_calls(tmp_path):
+    module = write_graph(tmp_path / "a.pt")
+    row = np.linspace(-1.0, 1.0, 5)
+    with torch.no_grad():
+        expected = module(torch.tensor(row[None], dtype=torch.float32))[0].numpy()
+    assert compute(read_torchscript_network(tmp_path / "a.pt"), row) == pytest.approx(expected, abs=1e-5)
+    write_graph(tmp_path / "a.pt", skips=True)
+    with pytest.raises(ArtifactError, match="its graph is no chain of layers"):
+        read_torchscript_network(tmp_path / "a.pt")
+
+
+def test_an_estimator_beside_the_perceptron_is_not_played(tmp_path):
+    class Estimating(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.actor = torch.nn.Sequential(torch.nn.Linear(8, 2))
+            self.estimator = torch.nn.Sequential(torch.nn.Linear(5, 3))
+
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return self.actor(torch.cat([x, self.estimator(x)], 1))
+
+    torch.jit.script(Estimating()).save(str(tmp_path / "a.pt"))
+    with pytest.raises(ArtifactError, match=r"a\.pt: it estimates what it does not observe \(HIMLoco\)") as raised:
+        read_torchscript_network(tmp_path / "a.pt")
+    assert "torch.onnx.export" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("name", "read"), [("a.onnx", read_onnx), ("a.pt", read_torchscript_network)])
+def test_a_file_of_a_gigabyte_is_not_read(tmp_path, name, read):
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(10**9)
+    with pytest.raises(ArtifactError, match=rf"{name}: .*too large"):
+        read(tmp_path / name)
+
+
 def test_weights_alone_are_no_network(tmp_path):
     torch.save({"actor.0.weight": torch.zeros(2, 5)}, tmp_path / "a.pt")
     with pytest.raises(ArtifactError, match=r"written by torch\.save"):
