@@ -94,7 +94,8 @@ def import_to_play(policy: str | None, files: ForeignFiles, settings: Sequence[s
     if not target.exists():
         write_checked(target, str(file), imported.policy)
     notes = [f"  {note}" for note in imported.notes]
-    output.print_notes([f"policy file {target}, from {imported.form}", *notes])
+    searched = f"if it does not walk: rlctl diagnose --policy {target}"
+    output.print_notes([f"policy file {target}, from {imported.form}; {searched}", *notes])
     return str(target), of_environment
 
 
