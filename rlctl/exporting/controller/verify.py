@@ -167,7 +167,8 @@ def verify_controller(
                     worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
-    episodes, played = [episode.episode for episode in recorded[:EPISODES]], []
+    episodes = [episode.episode for episode in recorded[:EPISODES]]
+    played: list[Episode] = []
     with output.show_progress("closed loop, controller", len(episodes), "episodes") as show:
         for episode in episodes:
             played.append(player.play(episode.result.seed, controller).episode)
