@@ -33,7 +33,7 @@ def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
     settings: Settings = [],
-    files: ForeignFiles = NO_FILES,
+    foreign: ForeignFiles = NO_FILES,
     min_success: MinSuccess = None,
     min_success_lower: MinSuccessLower = None,
     min_return: MinReturn = None,
@@ -66,8 +66,8 @@ def evaluate(
 
     began = time.monotonic()
     gates = Gates(min_success, min_success_lower, min_return)
-    if files.is_given:
-        run, settings = _import_foreign(options.run, options.baseline, files, settings)
+    if foreign.is_given:
+        run, settings = _import_foreign(options.run, options.baseline, foreign, settings)
         options = dataclasses.replace(options, run=run)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings, sim))
@@ -117,14 +117,14 @@ def evaluate(
 
 
 def _import_foreign(
-    policy: str | None, baseline: str | None, files: ForeignFiles, settings: list[str]
+    policy: str | None, baseline: str | None, foreign: ForeignFiles, settings: list[str]
 ) -> tuple[str, list[str]]:
     """Import a policy of another project; return its file and the settings of the environment."""
     if baseline is not None:
         raise UsageError(f"--policy {baseline} plays a task: leave out --deploy, --model and --terrain")
     from rlctl.importing.foreign.import_policy import import_to_play
 
-    return import_to_play(policy, files, settings)
+    return import_to_play(policy, foreign, settings)
 
 
 _BY_OUTCOME = ("--worst", "--best", "--failures")
@@ -156,7 +156,7 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
     }
 )
 def replay(
-    request: ReplayRequest, pretrained: Pretrained = False, files: ForeignFiles = NO_FILES, json: Json = None
+    request: ReplayRequest, pretrained: Pretrained = False, foreign: ForeignFiles = NO_FILES, json: Json = None
 ) -> None:
     """Show what a policy does, or what a task does before any training: Rerun recordings, without a display.
 
@@ -166,8 +166,8 @@ def replay(
     from rlctl.replaying.report import show
 
     checkpoint = choose_checkpoint(request.checkpoint, pretrained)
-    if files.is_given:
-        source, settings = _import_foreign(request.source, request.baseline, files, request.settings)
+    if foreign.is_given:
+        source, settings = _import_foreign(request.source, request.baseline, foreign, request.settings)
         request = dataclasses.replace(request, source=source, settings=settings)
     result = run_replay(dataclasses.replace(request, checkpoint=checkpoint))
     show(result, json)

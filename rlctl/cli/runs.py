@@ -218,7 +218,7 @@ def import_run(
     task: Annotated[str | None, Option(f"The task it was trained on. {TASK_FORMS}", metavar="TASK")] = None,
     vecnormalize: Annotated[Path | None, Option("Its normalisation, if it has one.", metavar="FILE.pkl")] = None,
     algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
-    files: ForeignFiles = NO_FILES,
+    foreign: ForeignFiles = NO_FILES,
     settings: Settings = [],
     output: Annotated[
         Path | None, Option("Policy file to write. Default: MODEL.safetensors.", ("--output", "-o"), metavar="FILE")
@@ -226,12 +226,12 @@ def import_run(
     json: Json = None,
 ) -> None:
     """Convert a model of Stable-Baselines3, or a policy of another project. Nothing in the model is executed."""
-    if files.is_given:
+    if foreign.is_given:
         if task is not None or vecnormalize is not None or algo is not None:
             raise UsageError(
                 "--deploy and --model are of a policy of another project: leave out --task, --vecnormalize and --algo"
             )
-        _import_foreign(file, files, settings, output, json)
+        _import_foreign(file, foreign, settings, output, json)
         return
     if task is None:
         raise UsageError(
@@ -246,12 +246,12 @@ def import_run(
 
 
 def _import_foreign(
-    policy: Path, files: ForeignFiles, settings: list[str], output: Path | None, json: str | None
+    policy: Path, foreign: ForeignFiles, settings: list[str], output: Path | None, json: str | None
 ) -> None:
     from rlctl.importing.foreign.import_policy import import_policy, show
     from rlctl.recipe.sources import parse_settings
 
-    show(import_policy(policy, files, settings=parse_settings(settings), output=output), json)
+    show(import_policy(policy, foreign, settings=parse_settings(settings), output=output), json)
 
 
 @app.command("rm")

@@ -170,8 +170,8 @@ def verify_controller(
     episodes = [episode.episode for episode in recorded[:EPISODES]]
     played: list[Episode] = []
     with output.show_progress("closed loop, controller", len(episodes), "episodes") as show:
-        for episode in episodes:
-            played.append(player.play(episode.result.seed, controller).episode)
+        for original in episodes:
+            played.append(player.play(original.result.seed, controller).episode)
             show(len(played))
     loop, different = compare_episodes(episodes, played), list_different(episodes, played)
     return ControllerAgreement(agreement, loop, None if target is None else worst, tuple(different))
