@@ -100,7 +100,8 @@ class PolicyError(TaskError):
 
 
 PLAY_OTHERS = (
-    "To play another program's policy, call it in a function act(observation): rlctl eval TASK --policy FILE.py:act"
+    "To play another project's policy of a walking robot: rlctl eval POLICY --deploy FILE --model ROBOT; "
+    "any other: call it in a function act(observation): rlctl eval TASK --policy FILE.py:act"
 )
 """What refusals of a foreign file advise."""
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.task import Body, Box, Event, Joints, Sim, TaskError
-from rlctl.task.deployment import COMMANDS, ORIENTATION, Deployment, ObservedPart
+from rlctl.task.deployment import COMMANDS, NOT_TRAINED, ORIENTATION, Deployment, ObservedPart
 from rlctl.task.rotations import rotate_inverse
 from rlctl_locomotion.walk import Walk
 
@@ -41,7 +41,8 @@ class Deployed(Walk):
         """Take from the deployment what other tasks define as a class."""
         if self.deployment is None or not self.robot_file:
             raise TaskError(
-                "Deployed: a task of imported policies: rlctl runs import POLICY --deploy FILE --model ROBOT"
+                "Deployed: a task of imported policies: rlctl runs import POLICY --deploy FILE --model ROBOT\n"
+                f"{NOT_TRAINED}"
             )
         described = self.described = self.deployment
         count = len(described.joints)

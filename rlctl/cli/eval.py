@@ -13,6 +13,7 @@ from typer.core import TyperCommand
 from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
 from rlctl.errors import UsageError
 from rlctl.evaluation.eval_request import EvalOptions, EvalRequest, Gates, MinReturn, MinSuccess, MinSuccessLower
+from rlctl.importing.foreign.request import NO_FILES, ForeignFiles
 from rlctl.options import Cluster, Json, Junit, On, Option, PictureFile, Pretrained, Settings, SimOption, Yes
 from rlctl.replaying.replay_request import ReplayRequest
 
@@ -22,6 +23,7 @@ from rlctl.replaying.replay_request import ReplayRequest
         "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
         "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
         "Robustness": ["vary", "push", "yes"],
+        "A policy of another project": ["deploy", "model", "terrain"],
         "How": ["sim", "deterministic", "limits", "env_timeout_s"],
         "Where": ["n_envs", "on", "cluster"],
         "Output": ["record", "picture", "json", "junit"],
@@ -31,6 +33,7 @@ def evaluate(
     options: EvalOptions,
     pretrained: Pretrained = False,
     settings: Settings = [],
+    foreign: ForeignFiles = NO_FILES,
     min_success: MinSuccess = None,
     min_success_lower: MinSuccessLower = None,
     min_return: MinReturn = None,
@@ -63,6 +66,9 @@ def evaluate(
 
     began = time.monotonic()
     gates = Gates(min_success, min_success_lower, min_return)
+    if foreign.is_given:
+        run, settings = _import_foreign(options.run, options.baseline, foreign, settings)
+        options = dataclasses.replace(options, run=run)
     chosen = dataclasses.replace(options, checkpoint=choose_checkpoint(options.checkpoint, pretrained))
     request = EvalRequest(**vars(chosen), changes=parse_changes(settings, sim))
     if on is not None and not vary:
@@ -110,6 +116,17 @@ def evaluate(
     return result.check(gates)
 
 
+def _import_foreign(
+    policy: str | None, baseline: str | None, foreign: ForeignFiles, settings: list[str]
+) -> tuple[str, list[str]]:
+    """Import a policy of another project; return its file and the settings of the environment."""
+    if baseline is not None:
+        raise UsageError(f"--policy {baseline} plays a task: leave out --deploy, --model and --terrain")
+    from rlctl.importing.foreign.import_policy import import_to_play
+
+    return import_to_play(policy, foreign, settings)
+
+
 _BY_OUTCOME = ("--worst", "--best", "--failures")
 
 
@@ -133,11 +150,14 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
     {
         "Options": ["baseline", "checkpoint", "pretrained", "task", "verify"],
         "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
+        "A policy of another project": ["deploy", "model", "terrain"],
         "Where": ["gui", "sim"],
         "Output": ["output", "video", "size", "camera", "json"],
     }
 )
-def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
+def replay(
+    request: ReplayRequest, pretrained: Pretrained = False, foreign: ForeignFiles = NO_FILES, json: Json = None
+) -> None:
     """Show what a policy does, or what a task does before any training: Rerun recordings, without a display.
 
     A function for --policy is act(observation) or act(observation, step) and returns an action; step counts from 0.
@@ -146,6 +166,9 @@ def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = 
     from rlctl.replaying.report import show
 
     checkpoint = choose_checkpoint(request.checkpoint, pretrained)
+    if foreign.is_given:
+        source, settings = _import_foreign(request.source, request.baseline, foreign, request.settings)
+        request = dataclasses.replace(request, source=source, settings=settings)
     result = run_replay(dataclasses.replace(request, checkpoint=checkpoint))
     show(result, json)
     result.check()

@@ -9,6 +9,7 @@ from typer.core import TyperGroup
 
 from rlctl.arguments import command, parse_changes
 from rlctl.errors import UsageError
+from rlctl.importing.foreign.request import NO_FILES, ForeignFiles
 from rlctl.options import (
     TASK_FORMS,
     Argument,
@@ -208,7 +209,7 @@ def _compare_maps(
 @app.command("import")
 @command
 def import_run(
-    model: Annotated[
+    file: Annotated[
         Path,
         Argument(
             "Model of Stable-Baselines3 or rl-zoo3; with --deploy or --model ONNX or TorchScript.", metavar="MODEL"
@@ -217,13 +218,7 @@ def import_run(
     task: Annotated[str | None, Option(f"The task it was trained on. {TASK_FORMS}", metavar="TASK")] = None,
     vecnormalize: Annotated[Path | None, Option("Its normalisation, if it has one.", metavar="FILE.pkl")] = None,
     algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
-    deploy: Annotated[
-        Path | None, Option("How a policy of another project is deployed: that project's YAML.", metavar="FILE")
-    ] = None,
-    robot: Annotated[
-        str | None, Option("The robot of a policy of another project: URDF or MJCF.", ("--model",), metavar="ROBOT")
-    ] = None,
-    terrain: Annotated[str | None, Option("Its ground: URDF or MJCF.", metavar="FILE", default_text="flat")] = None,
+    foreign: ForeignFiles = NO_FILES,
     settings: Settings = [],
     output: Annotated[
         Path | None, Option("Policy file to write. Default: MODEL.safetensors.", ("--output", "-o"), metavar="FILE")
@@ -231,12 +226,12 @@ def import_run(
     json: Json = None,
 ) -> None:
     """Convert a model of Stable-Baselines3, or a policy of another project. Nothing in the model is executed."""
-    if deploy is not None or robot is not None or terrain is not None:
+    if foreign.is_given:
         if task is not None or vecnormalize is not None or algo is not None:
             raise UsageError(
                 "--deploy and --model are of a policy of another project: leave out --task, --vecnormalize and --algo"
             )
-        _import_foreign(model, deploy, robot, terrain, settings, output, json)
+        _import_foreign(file, foreign, settings, output, json)
         return
     if task is None:
         raise UsageError(
@@ -246,27 +241,17 @@ def import_run(
     from rlctl.importing.import_model import find_normalizations, import_model, show
 
     changes = parse_changes(settings)
-    policy = import_model(model, task, normalization=vecnormalize, algo=algo, output=output, changes=changes)
-    show(policy, json, find_normalizations(model) if vecnormalize is None else [])
+    policy = import_model(file, task, normalization=vecnormalize, algo=algo, output=output, changes=changes)
+    show(policy, json, find_normalizations(file) if vecnormalize is None else [])
 
 
 def _import_foreign(
-    policy: Path,
-    deploy: Path | None,
-    robot: str | None,
-    terrain: str | None,
-    settings: list[str],
-    output: Path | None,
-    json: str | None,
+    policy: Path, foreign: ForeignFiles, settings: list[str], output: Path | None, json: str | None
 ) -> None:
-    if robot is None:
-        raise UsageError("--deploy needs the robot: --model ROBOT.urdf or ROBOT.xml")
     from rlctl.importing.foreign.import_policy import import_policy, show
     from rlctl.recipe.sources import parse_settings
 
-    values = parse_settings(settings)
-    imported = import_policy(policy, deploy, robot, terrain=terrain or "", settings=values, output=output)
-    show(imported, json)
+    show(import_policy(policy, foreign, settings=parse_settings(settings), output=output), json)
 
 
 @app.command("rm")

@@ -18,6 +18,7 @@ from rlctl.policy.shipped import Provenance
 from rlctl.runs import lookup
 from rlctl.runs.lookup import FoundPolicy
 from rlctl.storage import validation
+from rlctl.task.deployment import TASK
 
 
 def export_actor(request: ExportRequest) -> PolicyFile:
@@ -50,7 +51,13 @@ def _find_origin(source: FoundPolicy) -> dict[str, Any]:
             "git_commit": source.run.status().get("git_commit"),
             "recipe": source.run.recipe().model_dump(mode="json", by_alias=True),
         }
-    provenance = PolicyFile.read_info(source.file).provenance if source.file.suffix == ".safetensors" else None
+    info = PolicyFile.read_info(source.file) if source.file.suffix == ".safetensors" else None
+    if info is not None and info.spec.task == TASK:
+        raise UsageError(
+            f"{source.file}: an imported policy: the file itself is what to pass on, with its robot; "
+            f"its score: rlctl eval {source.file} --json FILE"
+        )
+    provenance = None if info is None else info.provenance
     if provenance is None:
         raise UsageError(f"{source.file}: the file does not contain the recipe of its training; give its run instead")
     return provenance.model_dump(include={"run", "git_commit", "recipe"})

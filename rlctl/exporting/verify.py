@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import operator
 import statistics
 import timeit
@@ -200,32 +201,66 @@ def verify(
     comparison.close()
     loop = compare_episodes(expected, actual)
     if comparison.agreement.agrees and not loop.agrees:
-        repeats = _repeats_episodes(torch_actor.file, workers, expected)
-        magnified = repeats and _magnifies_rounding(torch_actor.file, workers, expected)
+        different = list_different(expected, actual)
+        repeats, magnified = _check_conclusive(torch_actor.file, workers, expected, different)
         loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
     return comparison.agreement, loop
 
 
-def _repeats_episodes(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
-    """Return whether the policy has the same episodes when it plays again."""
-    again = _play_again(policy, workers, expected)
-    return again.agrees and again.max_return_difference == 0.0
+def list_different(expected: Sequence[Episode], actual: Sequence[Episode]) -> list[int]:
+    """Return which episodes of the same seeds differ, those that differ most first.
 
-
-def _magnifies_rounding(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> bool:
-    """Return whether episodes change with the last bits of the policy's weights.
-
-    Contacts cause this within some hundred steps; such episodes cannot show whether two policies are the same.
+    Only these are played again to find out why: an episode that did not differ has repeated itself.
     """
-    changed = (PolicyFile(policy.info, tensors) for tensors in change_last_bits(policy.tensors))
-    return any(not _play_again(policy, workers, expected).agrees for policy in changed)
+    pairs = [(ours.result, theirs.result) for ours, theirs in zip(expected, actual, strict=True)]
+    same = [ours.success == theirs.success and ours.length == theirs.length for ours, theirs in pairs]
+    differences = np.where(same, _compare_returns(expected, actual), np.inf)
+    order = np.argsort(-differences, kind="stable").tolist()
+    return [number for number in order if differences[number] > 0.0]
 
 
-def _play_again(policy: PolicyFile, workers: Workers, expected: Sequence[Episode]) -> ClosedLoop:
-    workers.set_policy(policy)
-    seeds = [episode.result.seed for episode in expected]
-    with output.show_progress("closed loop, policy again", len(seeds), "episodes") as show:
-        return compare_episodes(expected, play_episodes(workers, seeds, watch=show))
+def changes_again(
+    expected: Sequence[Episode],
+    numbers: Sequence[int],
+    play: Callable[[list[int]], Sequence[Episode]],
+    together: int,
+    *,
+    exactly: bool,
+) -> bool:
+    """Return whether some episodes are others when `play` plays their seeds again, `together` at a time.
+
+    It ends with the first that is another: `exactly`, or beyond the limits of `ClosedLoop.agrees`.
+    """
+    actual = list(expected)
+    with output.show_progress("closed loop, policy again", len(numbers), "episodes") as show:
+        for first in range(0, len(numbers), together):
+            show(first)
+            some = numbers[first : first + together]
+            for number, episode in zip(some, play([expected[k].result.seed for k in some]), strict=True):
+                actual[number] = episode
+            loop = compare_episodes(expected, actual)
+            if not loop.agrees or (exactly and loop.max_return_difference > 0.0):
+                return True
+    return False
+
+
+def _check_conclusive(
+    policy: PolicyFile, workers: Workers, expected: Sequence[Episode], different: Sequence[int]
+) -> tuple[bool, bool]:
+    """Return whether the policy repeats its episodes, and whether they change with the last bits of its weights.
+
+    Contacts cause such changes within some hundred steps; the episodes cannot show whether two policies are the same.
+    """
+
+    def changes(policy: PolicyFile, *, exactly: bool) -> bool:
+        workers.set_policy(policy)
+        play = functools.partial(play_episodes, workers)
+        return changes_again(expected, different, play, workers.n_envs, exactly=exactly)
+
+    if changes(policy, exactly=True):
+        return False, False
+    others = (PolicyFile(policy.info, tensors) for tensors in change_last_bits(policy.tensors))
+    return True, any(changes(other, exactly=False) for other in others)
 
 
 def change_last_bits(tensors: Tensors) -> Iterator[dict[str, NDArray[Any]]]:
@@ -247,10 +282,7 @@ def compare_episodes(expected: Sequence[Episode], actual: Sequence[Episode]) -> 
     """Compare episodes of the same seeds."""
     pairs = [(ours.result, theirs.result) for ours, theirs in zip(expected, actual, strict=True)]
     returns = np.array([[ours.total_reward, theirs.total_reward] for ours, theirs in pairs])
-    # Returns near 0 would have a large relative difference: they are compared with the mean |return|.
-    scale = np.maximum(np.abs(returns).max(axis=1), np.abs(returns).mean())
-    difference = np.abs(returns[:, 0] - returns[:, 1])
-    relative = np.divide(difference, scale, out=np.zeros_like(difference), where=scale > 0)
+    relative = _compare_returns(expected, actual)
     reports_success = any(result.success is not None for pair in pairs for result in pair)
     return ClosedLoop(
         episodes=len(pairs),
@@ -260,6 +292,15 @@ def compare_episodes(expected: Sequence[Episode], actual: Sequence[Episode]) -> 
         mean_return=float(returns[:, 0].mean()),
         mean_return_exported=float(returns[:, 1].mean()),
     )
+
+
+def _compare_returns(expected: Sequence[Episode], actual: Sequence[Episode]) -> NDArray[np.float64]:
+    """Return the difference of the returns of each episode, relative to |return|."""
+    returns = np.array([[ours.result.total_reward for ours in expected], [ours.result.total_reward for ours in actual]])
+    # Returns near 0 would have a large relative difference: they are compared with the mean |return|.
+    scale = np.maximum(np.abs(returns).max(axis=0), np.abs(returns).mean())
+    difference = np.abs(returns[0] - returns[1])
+    return np.divide(difference, scale, out=np.zeros_like(difference), where=scale > 0)
 
 
 def measure_latency(torch_actor: TorchActor, exported: OnnxActor | CActor) -> Latency:

@@ -90,10 +90,14 @@ class Network:
         return apply(self.trunk, value)
 
     def compute_std(self, latent: Array) -> Array:
-        """Return the standard deviations of Gaussian actions, shape (k, elements); (1, elements) if all are equal."""
+        """Return the standard deviations of Gaussian actions, shape (k, elements); (1, elements) if all are equal.
+
+        Raises `ValueError` if the policy has none.
+        """
         if self._log_std_layer is not None:
             return np.exp(np.clip(self._log_std_layer(latent), -20.0, 2.0))
-        assert self._std_row is not None  # called for Gaussian heads only
+        if self._std_row is None:  # called for Gaussian heads only
+            raise ValueError("log_std is missing")
         return self._std_row
 
 

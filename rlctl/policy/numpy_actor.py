@@ -90,7 +90,8 @@ class NumpyActor(FileActor):
         """Return the noise of the policy's distribution, shape (k, elements)."""
         if self._matrices is None:
             return self.network.compute_std(latent) * self._noise.sample.draw(rows)
-        assert self.network.std is not None  # of gSDE's parameter
+        if self.network.std is None:  # of gSDE's parameter
+            raise ValueError("log_std is missing")
         period = self._exploration.sde_every
         return self._matrices.multiply(latent, rows, self.network.std, self._low.size, period)
 

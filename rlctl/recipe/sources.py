@@ -20,7 +20,7 @@ _DEEPEST_KEY = 20
 _FEWEST_EVALUATIONS = 5
 _WITH_UNIT = re.compile(r"([\d.]+)([kKmM])")
 _DEFAULT_ROLLOUT = 4096  # [steps], all environments together
-_OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events", "sim")
+OF_THE_ENVIRONMENT = ("task", "reward_weights", "randomize", "events", "sim")
 _DEFAULT_ALGORITHM = "ppo"
 _OF_THE_ALGORITHM = ("algo", "algo_kwargs", "policy_kwargs", "her", "normalize", "mirror", "mirror_loss")
 _OF_ANY_ALGORITHM = ("n_envs", "total_timesteps")  # how much is trained: equal where algorithms are compared
@@ -213,10 +213,10 @@ def parse_changes(settings: list[str]) -> EnvChanges:
 def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:
     """Check changes of an environment, given as keys of a recipe; raises `RecipeError` for any other key."""
     for key in values:
-        if key not in _OF_THE_ENVIRONMENT:
+        if key not in OF_THE_ENVIRONMENT:
             can = "task.NAME, reward_weights.NAME, randomize, events.NAME and sim can be set here"
             parameter = "" if key in Recipe.model_fields else f"task.{key}"
-            raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, _OF_THE_ENVIRONMENT, parameter)}")
+            raise RecipeError(f"{source} {key}: only {can}.{did_you_mean(key, OF_THE_ENVIRONMENT, parameter)}")
     recipe = validate(values, source)
     randomize = recipe.randomize if "randomize" in values else None
     return EnvChanges(recipe.task, recipe.reward_weights, randomize, recipe.events, recipe.sim or Engine())

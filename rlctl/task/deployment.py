@@ -27,6 +27,11 @@ Kind = Literal[
 ]
 TASK = "rlctl_locomotion.deployed:Deployed"
 """The task that plays deployed policies."""
+NOT_TRAINED = (
+    "an imported policy is not trained further: rlctl distill POLICY trains a student of it, "
+    "rlctl tasks new NAME --model ROBOT makes a task of the robot to train"
+)
+"""What refusals of a training say."""
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """What the observation `command` consists of [m/s, m/s, rad/s], in this order."""
 ORIENTATION = "orientation"  # the quantity from which gravity and Euler angles are computed

@@ -30,15 +30,15 @@ def look_along(direction: ArrayLike) -> Array:
     """Return the axes of a camera that looks along a direction of any length, which is not vertical: to the right,
     which is level, up, and forward, as rows of shape (3, 3)."""
     forward = normalize(direction)
-    right = normalize(_cross(forward, np.array([0.0, 0.0, 1.0])))
-    return np.stack([right, _cross(right, forward), forward])
+    right = normalize(cross(forward, np.array([0.0, 0.0, 1.0])))
+    return np.stack([right, cross(right, forward), forward])
 
 
 def multiply(first: ArrayLike, second: ArrayLike) -> Array:
     """Return the rotations that rotate by `second`, then by `first`; shapes (..., 4)."""
     one, two = np.asarray(first, np.float64), np.asarray(second, np.float64)
     (u, a), (v, b) = ((rows[..., :3], rows[..., 3:]) for rows in (one, two))
-    axes = a * v + b * u + _cross(u, v)
+    axes = a * v + b * u + cross(u, v)
     return np.concatenate([axes, a * b - (u * v).sum(axis=-1, keepdims=True)], axis=-1)
 
 
@@ -46,8 +46,8 @@ def rotate(orientation: ArrayLike, vector: ArrayLike) -> Array:
     """Turn vectors by quaternions: from the frame with this orientation to the world; shapes (..., 4) and (..., 3)."""
     quaternions, rows = np.asarray(orientation, np.float64), np.asarray(vector, np.float64)
     axis, w = quaternions[..., :3], quaternions[..., 3:]
-    twice = 2.0 * _cross(axis, rows)
-    return np.asarray(rows + w * twice + _cross(axis, twice))
+    twice = 2.0 * cross(axis, rows)
+    return np.asarray(rows + w * twice + cross(axis, twice))
 
 
 def rotate_inverse(orientation: ArrayLike, vector: ArrayLike) -> Array:
@@ -58,10 +58,17 @@ def rotate_inverse(orientation: ArrayLike, vector: ArrayLike) -> Array:
     return rotate(invert(orientation), vector)
 
 
-def _cross(a: Array, b: Array) -> Array:
-    # A fifth of the time of `np.cross`, which moves axes.
-    (ax, ay, az), (bx, by, bz) = ((rows[..., 0], rows[..., 1], rows[..., 2]) for rows in (a, b))
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+def cross(a: Array, b: Array) -> Array:
+    """Return the cross products of vectors, shape (..., 3)."""
+    # A tenth of the time of `np.cross`, which moves axes, for one row.
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    first = ay * bz - az * by
+    product = np.empty((*np.shape(first), 3))
+    product[..., 0] = first
+    product[..., 1] = az * bx - ax * bz
+    product[..., 2] = ax * by - ay * bx
+    return product
 
 
 def roll_pitch_yaw(orientation: Sequence[float]) -> tuple[float, float, float]:

@@ -7,6 +7,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, TaskError
 from rlctl.exporting.c_source import find_compiler
 from rlctl.importing.foreign.import_policy import import_policy
+from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.load import check_playable
 from rlctl.task.deployment import TASK, Deployment
@@ -34,7 +35,7 @@ def import_walk(tmp_path):
         right = describe_walk()
         file = write_onnx(tmp_path / "walk.onnx", expect_as(read_walk(), right))
         deploy = write_yaml(tmp_path / "deploy.yaml", {**right, **mistakes})
-        return import_policy(file, deploy, A1, output=tmp_path / "walk.safetensors").policy
+        return import_policy(file, ForeignFiles(deploy, A1), output=tmp_path / "walk.safetensors").policy
 
     return run
 

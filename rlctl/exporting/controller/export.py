@@ -6,6 +6,7 @@ import os
 import platform
 import tempfile
 import timeit
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -186,14 +187,13 @@ class _Export:
     def _record(self, is_limited: bool) -> list[verify.Recorded]:
         return verify.record(self.player, self._make_reference(self.torch_actor, is_limited))
 
-    @functools.lru_cache(maxsize=2)  # noqa: B019
-    def _check_conclusive(self, is_limited: bool) -> tuple[bool, bool]:
+    def _check_conclusive(self, is_limited: bool, different: Sequence[int]) -> tuple[bool, bool]:
         changed = (
             dataclasses.replace(self.policy, tensors=tensors) for tensors in change_last_bits(self.policy.tensors)
         )
         others = (self._make_reference(NumpyActor(policy), is_limited) for policy in changed)
         original = self._make_reference(self.torch_actor, is_limited)
-        return verify.check_conclusive(self.player, original, others, self._record(is_limited))
+        return verify.check_conclusive(self.player, original, others, self._record(is_limited), different)
 
     def _verify(
         self, path: Path, controller: Controller, target: JointTarget | None, *, is_limited: bool
@@ -203,7 +203,7 @@ class _Export:
         result = verify.verify_controller(self.player, recorded, MappedController(controller, self.mapping), target)
         agreement, loop = result.agreement, result.closed_loop
         if agreement.agrees and not loop.agrees:
-            repeats, magnified = self._check_conclusive(is_limited)
+            repeats, magnified = self._check_conclusive(is_limited, result.different)
             loop = dataclasses.replace(loop, repeats=repeats, magnified=magnified)
         check_verified(path, self.torch_actor.file.path, agreement, loop)
         fields = {"agreement": agreement, "closed_loop": loop, "max_target_difference": result.max_target_difference}

@@ -16,7 +16,15 @@ from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
 from rlctl.exporting.controller.controllers import CController, Controller, Inputs
 from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
-from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, compare_episodes
+from rlctl.exporting.verify import (
+    EPISODES,
+    MAX_DIFFERENCE,
+    Agreement,
+    ClosedLoop,
+    changes_again,
+    compare_episodes,
+    list_different,
+)
 from rlctl.limits.limited import Limited
 from rlctl.limits.limits import Limits
 from rlctl.play.collect import MOST_STEPS, Episode
@@ -103,6 +111,7 @@ class ControllerAgreement:
     agreement: Agreement
     closed_loop: ClosedLoop
     max_target_difference: float | None  # in the unit of the targets; None without targets
+    different: tuple[int, ...]  # episodes that differ in closed loop, those that differ most first
 
 
 def record(player: TaskPlayer, reference: Actor) -> list[Recorded]:
@@ -159,35 +168,38 @@ def verify_controller(
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
     episodes = [episode.episode for episode in recorded[:EPISODES]]
-    loop = compare_episodes(episodes, _play_again(player, controller, episodes, "closed loop, controller"))
-    return ControllerAgreement(agreement, loop, None if target is None else worst)
-
-
-def _play_again(player: TaskPlayer, actor: Actor, episodes: Sequence[Episode], what: str) -> list[Episode]:
-    """Play the seeds of episodes with an actor, and show the progress of `what`."""
     played: list[Episode] = []
-    with output.show_progress(what, len(episodes), "episodes") as show:
-        for episode in episodes:
-            played.append(player.play(episode.result.seed, actor).episode)
+    with output.show_progress("closed loop, controller", len(episodes), "episodes") as show:
+        for original in episodes:
+            played.append(player.play(original.result.seed, controller).episode)
             show(len(played))
-    return played
+    loop, different = compare_episodes(episodes, played), list_different(episodes, played)
+    return ControllerAgreement(agreement, loop, None if target is None else worst, tuple(different))
 
 
 def check_conclusive(
-    player: TaskPlayer, reference: Actor, changed: Iterable[Actor], recorded: Sequence[Recorded]
+    player: TaskPlayer,
+    reference: Actor,
+    changed: Iterable[Actor],
+    recorded: Sequence[Recorded],
+    different: Sequence[int],
 ) -> tuple[bool, bool]:
     """Return whether a policy repeats its recorded episodes, and whether they change with the last bits of its weights.
 
-    `changed` are the policy with other last bits, within the same limits.
+    `changed` are the policy with other last bits, within the same limits; `different` are the episodes that a
+    controller plays otherwise, those that differ most first.
     """
     episodes = [episode.episode for episode in recorded[:EPISODES]]
 
-    def play_again(actor: Actor) -> ClosedLoop:
-        return compare_episodes(episodes, _play_again(player, actor, episodes, "closed loop, policy again"))
+    def changes(actor: Actor, *, exactly: bool) -> bool:
+        def play(seeds: list[int]) -> list[Episode]:
+            return [player.play(seed, actor).episode for seed in seeds]
 
-    loop = play_again(reference)
-    repeats = loop.agrees and loop.max_return_difference == 0.0
-    return repeats, repeats and any(not play_again(other).agrees for other in changed)
+        return changes_again(episodes, different, play, 1, exactly=exactly)
+
+    if changes(reference, exactly=True):
+        return False, False
+    return True, any(changes(other, exactly=False) for other in changed)
 
 
 def _compare(agreement: Agreement, expected: NDArray[Any], actual: NDArray[Any]) -> float:

@@ -124,3 +124,11 @@ def pick(values: Sequence[Any], order: Sequence[int], source: str, name: str) ->
         if not isinstance(index, int) or not 0 <= index < len(values):
             raise UsageError(f"{source}: {name} has the index {index!r}, and there are {len(values)} values")
     return [values[index] for index in order]
+
+
+def refuse_motion(name: str, source: str) -> None:
+    """Raise `UsageError` for an observation of a policy that tracks a motion: by a reference, or by its phase."""
+    if "motion" in name or "anchor" in name or name.endswith("/phase"):
+        raise UsageError(
+            f"{source}: observes {name}: it tracks a motion; only policies that follow velocity commands are imported"
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -16,9 +17,11 @@ from rlctl.importing.foreign import metadata, own, rl_sar, unitree_gym, unitree_
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.importing.foreign.onnx_network import read_onnx
+from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.importing.foreign.torchscript import read_torchscript_network
 from rlctl.importing.import_model import write_checked
 from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.recipe.sources import OF_THE_ENVIRONMENT, parse_settings
 from rlctl.storage import yaml_text
 from rlctl.task.deployment import TASK, Deployment
 from rlctl.task.model_files import find_model_file
@@ -54,10 +57,8 @@ class ImportedPolicy:
 
 def import_policy(
     file: Path,
-    deploy: Path | None,
-    model: str,
+    files: ForeignFiles,
     *,
-    terrain: str = "",
     settings: Mapping[str, Any] | None = None,
     output: Path | None = None,
 ) -> ImportedPolicy:
@@ -71,13 +72,56 @@ def import_policy(
         raise UsageError(f"--output {output}: the name of a policy file ends in .safetensors")
     if output is None and target.exists():
         raise UsageError(f"{target} exists already; give another name: --output FILE")
+    imported = _read(file, files, settings or {}, target)
+    write_checked(target, str(file), imported.policy)
+    return imported
+
+
+def import_to_play(policy: str | None, files: ForeignFiles, settings: Sequence[str]) -> tuple[str, list[str]]:
+    """Import a policy for a command that plays it; return the policy file and the settings of the environment.
+
+    The file is in the current folder. It has the name of the policy, with a number where another policy has that name;
+    a file of the same import is used again. All other settings are of the deployment. Raises as `import_policy` does.
+    """
+    if policy is None:
+        raise UsageError("--model: give the policy of the other project, an ONNX (.onnx) or TorchScript (.pt) file")
+    kinds = {text: text.partition("=")[0].partition(".")[0].strip() for text in settings}
+    of_environment = [text for text in settings if kinds[text] in OF_THE_ENVIRONMENT]
+    of_deployment = [text for text in settings if kinds[text] not in OF_THE_ENVIRONMENT]
+    file = Path(policy)
+    imported = _read(file, files, parse_settings(of_deployment), Path(f"{file.stem}.safetensors"))
+    target = _choose_name(imported.policy)
+    if not target.exists():
+        write_checked(target, str(file), imported.policy)
+    notes = [f"  {note}" for note in imported.notes]
+    searched = f"if it does not walk: rlctl diagnose --policy {target}"
+    output.print_notes([f"policy file {target}, from {imported.form}; {searched}", *notes])
+    return str(target), of_environment
+
+
+def _choose_name(policy: PolicyFile) -> Path:
+    """Return where a policy is stored: a new file, or one that has this policy already."""
+    content, first = policy.encode(), Path(str(policy.path))
+    path = first
+    for number in itertools.count(2):
+        if not path.exists() or path.read_bytes() == content:
+            break
+        path = first.with_stem(f"{first.stem}-{number}")
+    return path
+
+
+def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: Path) -> ImportedPolicy:
+    """Return a policy that is to be written to `target`."""
+    if files.model is None:
+        raise UsageError("--deploy needs the robot: --model ROBOT.urdf or ROBOT.xml")
     network, own_metadata = read_network(file)
-    robot = read_robot(find_model_file(model))
-    draft, form = read_draft(file, deploy, own_metadata, robot, network)
-    deployment = draft.complete(settings or {}, robot, network)
-    ground = str(find_model_file(terrain).resolve()) if terrain else ""
+    robot = read_robot(find_model_file(files.model))
+    draft, form = read_draft(file, files.deploy, own_metadata, robot, network)
+    deployment = draft.complete(settings, robot, network)
+    ground = ""
+    if files.terrain:
+        ground = str(find_model_file(files.terrain).resolve())
     policy = make_policy(network, deployment, {"robot_file": str(robot.path), "terrain": ground}, target)
-    write_checked(target, str(file), policy)
     return ImportedPolicy(policy, deployment, form, tuple(draft.notes))
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rlctl.task.deployment import Deployment
 
 Array = NDArray[np.float64]
+LARGEST_FILE = 256 * 2**20  # [bytes]; policies of walking robots have less than 10 MB
 _LOG_STD = -3.0  # of exploration, which exported policies do not have; only further training uses it
 _LSTM_PARTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
@@ -133,7 +134,14 @@ def _add(tensors: dict[str, Any], name: str, linear: ForeignLinear) -> None:
 
 
 class NotImportable(ValueError):
-    """A network is of a kind that rlctl does not import; the text says why."""
+    """A network is of a kind that rlctl does not import; the text says why.
+
+    `in_no_form`: it is not imported from another kind of file either.
+    """
+
+    def __init__(self, text: str, *, in_no_form: bool = False) -> None:
+        super().__init__(text)
+        self.in_no_form = in_no_form
 
 
 Layer = tuple[str, Any]

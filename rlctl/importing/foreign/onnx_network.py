@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, short_repr
-from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork, Layer, NotImportable, assemble
+from rlctl.importing.foreign.network import (
+    LARGEST_FILE,
+    Array,
+    ForeignLinear,
+    ForeignLstm,
+    ForeignNetwork,
+    Layer,
+    NotImportable,
+    assemble,
+)
 from rlctl.policy.layers import ACTIVATIONS
 from rlctl.policy.onnx_policy import check, open_session
 from rlctl.storage import untrusted
@@ -21,13 +31,16 @@ _PASSED_ON = ("Identity", "Flatten", "Cast", "Squeeze", "Unsqueeze", "Dropout")
 _ACTIVATIONS = {"Elu": "elu", "Relu": "relu", "Tanh": "tanh"}
 _SIGMOID = "sigmoid"
 _RECURRENT = ("LSTM", "GRU", "RNN")
+_LSTM = "lstm"
+_STATES_AT = 5  # of the inputs of an LSTM node: the hidden state, then the cell state
+_GATES = (0, 2, 3, 1)  # ONNX has input, output, forget, cell; torch input, forget, cell, output
 _MOST_NODES = 2000
 _COMPARED, _TOLERANCE = 16, 1e-4  # random observations with which the network is compared with the graph
 
 
 def read_onnx(path: Path) -> tuple[ForeignNetwork, dict[str, str]]:
     """Return the network of a graph and the graph's metadata; raises `ArtifactError` for one that is not imported."""
-    content = untrusted.read_bytes(path)
+    content = untrusted.read_bytes(path, LARGEST_FILE)
     try:
         check(content)
         network, metadata = _read(content)
@@ -45,15 +58,24 @@ def _read(content: bytes) -> tuple[ForeignNetwork, dict[str, str]]:
     constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
     _check_form(graph, constants)
     reader = _ChainReader(constants)
-    (given,) = [value.name for value in graph.input if value.name not in constants]
-    reader.values[given] = []
+    reader.values[_list_inputs(graph, constants)[0].name] = []
     for node in graph.node:
         reader.read(node)
     layers = reader.values.get(graph.output[0].name)
     if layers is None:
         raise NotImportable("its output does not depend on its input")
     metadata = {str(entry.key): str(entry.value) for entry in model.metadata_props}
-    return assemble(layers, ACTIVATIONS), metadata
+    lstm = None
+    if layers and layers[0][0] == _LSTM:
+        lstm = layers[0][1]
+        layers = layers[1:]
+    return assemble(layers, ACTIVATIONS, lstm), metadata
+
+
+def _list_inputs(graph: onnx.GraphProto, constants: dict[str, Any]) -> list[onnx.ValueInfoProto]:
+    """Return the inputs of a graph, without weights and without the states of an LSTM."""
+    states = {name for node in graph.node if node.op_type == "LSTM" for name in node.input[_STATES_AT:]}
+    return [value for value in graph.input if value.name not in constants and value.name not in states]
 
 
 def _check_form(graph: onnx.GraphProto, constants: dict[str, Any]) -> None:
@@ -64,13 +86,10 @@ def _check_form(graph: onnx.GraphProto, constants: dict[str, Any]) -> None:
     if own:
         raise NotImportable(f"its graph has the custom operator {own[0]}; export it with standard operators")
     recurrent = [node.op_type for node in graph.node if node.op_type in _RECURRENT]
-    inputs = [value for value in graph.input if value.name not in constants]
+    inputs = _list_inputs(graph, constants)
     names = ", ".join(value.name for value in inputs)
-    if recurrent:
-        raise NotImportable(
-            f"its graph has hidden states ({recurrent[0]}; inputs {names}); "
-            "recurrent policies are imported from TorchScript (.pt)"
-        )
+    if recurrent not in ([], ["LSTM"]):
+        raise NotImportable(f"its graph has hidden states ({', '.join(recurrent)}); one layer of LSTM is imported")
     if len(inputs) != 1:
         hint = ""
         if "time_step" in names:
@@ -106,6 +125,9 @@ class _ChainReader:
             self._fold(node)
             return
         layers = self.values[moving[0]]
+        if node.op_type == "LSTM":
+            self.values[node.output[0]] = [(_LSTM, _read_lstm(layers, node, self._get, attributes))]
+            return
         if len(moving) == 2:
             self.values[node.output[0]] = self._join(node, moving)
             return
@@ -176,6 +198,37 @@ def _read_gemm(others: list[NDArray[Any]], attributes: dict[str, Any]) -> Foreig
     return ForeignLinear(weight, bias)
 
 
+def _read_lstm(
+    layers: list[Layer],
+    node: onnx.NodeProto,
+    get: Callable[[str], NDArray[Any]],
+    attributes: dict[str, Any],
+) -> ForeignLstm:
+    """Return the LSTM of a node; what normalises its input, `layers`, becomes part of it."""
+    changed = set(attributes) - {"hidden_size", "layout"}
+    if changed or attributes.get("layout"):
+        raise NotImportable(f"its LSTM is of another kind than torch's ({', '.join(sorted(changed)) or 'layout'})")
+    if len(node.input) != _STATES_AT + 2:
+        raise NotImportable("the states of its LSTM are no inputs of the graph")
+    weight, recurrent, biases = (get(name).astype(float) for name in node.input[1:4])
+    if weight.ndim != len("dgi") or len(weight) != 1:
+        raise NotImportable("its LSTM runs in two directions")
+    of_input, of_state = np.split(biases[0], 2)
+    first = ForeignLinear(_order_gates(weight[0]), _order_gates(of_input))
+    for kind, content in reversed(layers):
+        if kind != "affine":
+            raise NotImportable(f"{kind} is in front of its LSTM")
+        factor, shift = (number * np.ones(weight.shape[2]) for number in content)
+        first = ForeignLinear(first.weight * factor, first.bias + first.weight @ shift)
+    return ForeignLstm(((first.weight, _order_gates(recurrent[0]), first.bias, _order_gates(of_state)),))
+
+
+def _order_gates(rows: Array) -> Array:
+    """Return rows of ONNX's gates in torch's order."""
+    gates = np.split(rows, len(_GATES))
+    return np.concatenate([gates[number] for number in _GATES])
+
+
 def _read_affine(kind: str, number: Any, *, is_first: bool) -> tuple[Any, Any]:
     if kind == "Add":
         return np.ones(1), number
@@ -191,21 +244,45 @@ def _read_affine(kind: str, number: Any, *, is_first: bool) -> tuple[Any, Any]:
 def _compare(content: bytes, network: ForeignNetwork) -> None:
     """Raise `NotImportable` if the graph computes something else than the network that was read from it."""
     session = open_session(content)
-    given = session.get_inputs()[0]
+    given, *states = session.get_inputs()
     rows = np.random.default_rng(0).normal(size=(_COMPARED, network.observation_size)).astype(np.float32)
+    size = 0 if network.lstm is None else network.lstm.hidden_size
+    feed = {state.name: np.zeros((1, 1, size), np.float32) for state in states}
+    own = np.zeros((2, size))  # hidden and cell state
     for row in rows:
-        shaped = row[None] if len(given.shape) == 2 else row
+        feed[given.name] = row[None] if len(given.shape) == 2 else row
         try:
-            expected = np.ravel(session.run([session.get_outputs()[0].name], {given.name: shaped})[0])
+            expected, *following = session.run(None, feed)
         except Exception as error:  # onnxruntime's own errors have no public base class
             raise NotImportable(f"its graph does not run: {short_repr(str(error), 150)}") from None
-        value = compute(network, row)
-        if expected.shape != value.shape or not np.allclose(value, expected, rtol=_TOLERANCE, atol=_TOLERANCE):
+        feed.update(zip((state.name for state in states), following, strict=False))
+        value = row
+        if network.lstm is not None:
+            own = step_lstm(network.lstm, row, own)
+            value = own[0]
+        value = compute(network, value)
+        if np.shape(np.ravel(expected)) != value.shape or not np.allclose(
+            value, np.ravel(expected), rtol=_TOLERANCE, atol=_TOLERANCE
+        ):
             raise NotImportable("its graph computes something else than the layers that were read from it")
 
 
+def step_lstm(lstm: ForeignLstm, row: NDArray[Any], states: Array) -> Array:
+    """Return the hidden and the cell state, shape (2, size), of one layer after an observation."""
+    ((weight_ih, weight_hh, bias_ih, bias_hh),) = lstm.layers
+    hidden, cell = states
+    gates = weight_ih @ row + bias_ih + weight_hh @ hidden + bias_hh
+    enter, forget, candidate, leave = np.split(gates, len(_GATES))
+    cell = _squash(forget) * cell + _squash(enter) * np.tanh(candidate)
+    return np.stack([_squash(leave) * np.tanh(cell), cell])
+
+
+def _squash(value: Array) -> Array:
+    return np.asarray(1.0 / (1.0 + np.exp(-value)))
+
+
 def compute(network: ForeignNetwork, row: NDArray[Any]) -> NDArray[Any]:
-    """Return the action of a network without an LSTM, shape (actions,), for an observation of shape (size,)."""
+    """Return the action of the linear layers, shape (actions,), for an observation, or the state of an LSTM."""
     value = np.asarray(row, np.float64)
     for number, linear in enumerate(network.linears):
         if number:

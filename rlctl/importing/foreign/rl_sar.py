@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rlctl.errors import UsageError, check_name
-from rlctl.importing.foreign.draft import Draft, pick
+from rlctl.importing.foreign.draft import Draft, pick, refuse_motion
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.storage import yaml_text
 from rlctl.task.mujoco.robot import Robot
@@ -88,6 +88,7 @@ def _read_base(config: Path, robot: str) -> dict[str, Any]:
 
 
 def _read_term(name: str, config: Mapping[str, Any], history: int, source: str) -> dict[str, Any]:
+    refuse_motion(name, source)
     check_name(name, _TERMS, f"{source}: no known observation is", UsageError, listed="It knows")
     part: dict[str, Any] = {"kind": _TERMS[name], "history": history}
     scale = config.get(_SCALES.get(name, ""), 1.0)

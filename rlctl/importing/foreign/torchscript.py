@@ -6,13 +6,16 @@ parts from the code of the exported module, as text: a module that does more tha
 
 from __future__ import annotations
 
+import ast
 import re
+import textwrap
 from pathlib import Path
 
 import numpy as np
 
 from rlctl.errors import ArtifactError, short_repr
 from rlctl.importing.foreign.network import (
+    LARGEST_FILE,
     Array,
     ForeignLinear,
     ForeignLstm,
@@ -31,23 +34,29 @@ _TRUNKS = ("actor", "actor_mlp", "policy", "mlp", "net")  # names of the percept
 _RECURRENT = ("rnn", "memory", "memory_a")
 _NORMALIZERS = ("normalizer", "obs_normalizer")
 _HARMLESS = {"unsqueeze", "squeeze", "slice", "copy_", "linear", "elu", "relu", "tanh", "silu", "to", "detach"}
+_LONGEST_CODE = 100_000  # characters
 _CONVERT = "convert it where it was trained: torch.onnx.export(policy, zeros, 'policy.onnx')"
 
 
 def read_torchscript_network(path: Path) -> ForeignNetwork:
     """Return the network of a TorchScript file; raises `ArtifactError` for one that is not imported."""
-    content = untrusted.read_bytes(path)
+    content = untrusted.read_bytes(path, LARGEST_FILE)
     try:
         return _read(read_torchscript(content))
     except NotImportable as error:
-        raise ArtifactError(f"{path}: {error}; {_CONVERT}") from None
+        text = str(error)
+        if not error.in_no_form:
+            text = f"{text}; {_CONVERT}"
+        raise ArtifactError(f"{path}: {text}") from None
     except (NotPlainData, *untrusted.ZIP_ERRORS, LookupError, TypeError, AttributeError) as error:
         raise ArtifactError(f"{path}: damaged, or not TorchScript: {short_repr(str(error), 200)}") from None
 
 
 def _read(module: Module) -> ForeignNetwork:
-    if _find_class(module) == "Sequential":
+    if _find_class(module) in ("Sequential", "GraphModule"):
         return assemble(_list_layers(module), ACTIVATIONS)
+    if "estimator" in module.modules:
+        raise NotImportable("it estimates what it does not observe (HIMLoco), which rlctl cannot play", in_no_form=True)
     trunk = _choose(module, _TRUNKS)
     if trunk is None:
         raise NotImportable(f"its module {_find_class(module)} has none of the parts {', '.join(_TRUNKS)}")
@@ -73,12 +82,7 @@ def _choose(module: Module, names: tuple[str, ...]) -> str | None:
 
 def _check_code(module: Module, known: list[str]) -> None:
     """Raise `NotImportable` if the module's `forward` does more than to call the known parts one after the other."""
-    start = module.code.find("def forward(")
-    if start < 0:
-        raise NotImportable(f"its module {_find_class(module)} has no forward")
-    body = module.code[start:]
-    end = body.find("\n  def ", 1)
-    body = body if end < 0 else body[:end]
+    body = _find_forward(module)
     called = set(re.findall(r"\((\w+)\)\.forward", body))
     functions = set(re.findall(r"\btorch\.(?!nn\b)(\w+)\(", body)) - _HARMLESS
     functions |= {name.rpartition(".")[2] for name in re.findall(r"__torch__\.torch\.nn\.functional\.\w+", body)}
@@ -91,10 +95,20 @@ def _check_code(module: Module, known: list[str]) -> None:
         raise NotImportable(f"its forward calls the part {others[0]!r}, which rlctl does not know")
 
 
+def _find_forward(module: Module) -> str:
+    """Return the code of a module's `forward`."""
+    start = module.code.find("def forward(")
+    if start < 0:
+        raise NotImportable(f"its module {_find_class(module)} has no forward")
+    body = module.code[start:]
+    end = body.find("\n  def ", 1)
+    return body if end < 0 else body[:end]
+
+
 def _list_layers(module: Module) -> list[Layer]:
-    """Return the layers of a `Sequential`, in the order of its numbers."""
+    """Return the layers of a `Sequential`, in the order of its numbers, or of a graph, in the order of its calls."""
     layers: list[Layer] = []
-    for name in sorted(module.modules, key=_read_number):
+    for name in _list_names(module):
         part = module.modules[name]
         kind = _find_class(part)
         if kind == "Sequential":
@@ -111,6 +125,55 @@ def _list_layers(module: Module) -> list[Layer]:
         elif kind != "Identity":
             raise NotImportable(f"its perceptron has a {kind}; known are Linear, {', '.join(_ACTIVATIONS)}")
     return layers
+
+
+def _list_names(module: Module) -> list[str]:
+    if _find_class(module) != "GraphModule":
+        return sorted(module.modules, key=_read_number)
+    text = textwrap.dedent("  " + _find_forward(module).rstrip())
+    try:
+        (function,) = ast.parse(text[:_LONGEST_CODE]).body
+        names = _read_chain(function)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise NotImportable("its graph is no chain of layers") from None
+    if sorted(names) != sorted(module.modules):
+        raise NotImportable("its graph is no chain of layers")
+    return names
+
+
+def _read_chain(function: ast.stmt) -> list[str]:
+    """Return the parts that a graph calls, in their order; raises `ValueError` if it does anything else.
+
+    Its code is `a = getattr(self, "actor/0/Gemm")`, `b = (a).forward(input, )`, and so on; calls may be nested.
+    """
+    parts: dict[str, str] = {}
+    values: dict[str, list[str]] = {}
+
+    def follow(value: ast.expr) -> list[str]:
+        match value:
+            case ast.Name(id=name) if name in values:
+                return values[name]
+            case ast.Call(func=ast.Attribute(value=ast.Name(id=part), attr="forward"), args=[given]) if part in parts:
+                return [*follow(given), parts[part]]
+        raise ValueError(ast.dump(value))
+
+    match function:
+        case ast.FunctionDef(args=ast.arguments(args=[ast.arg(arg="self"), ast.arg(arg=given)])):
+            values[given] = []
+        case _:
+            raise ValueError("no forward of one input")
+    for line in function.body:
+        match line:
+            case ast.Assign(
+                targets=[ast.Name(id=variable)],
+                value=ast.Call(func=ast.Name(id="getattr"), args=[ast.Name(id="self"), ast.Constant(value=str(name))]),
+            ):
+                parts[variable] = name
+            case ast.Assign(targets=[ast.Name(id=variable)], value=value):
+                values[variable] = follow(value)
+            case ast.Return(value=ast.expr() as value):
+                return follow(value)
+    raise ValueError("it returns nothing")
 
 
 def _read_number(name: str) -> int:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rlctl.errors import UsageError, check_name
-from rlctl.importing.foreign.draft import Draft, pick
+from rlctl.importing.foreign.draft import Draft, pick, refuse_motion
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.task.mujoco.robot import Robot
 
@@ -88,10 +88,7 @@ def _read_action(actions: Mapping[str, Any], default: Any, source: str, draft: D
 
 def read_term(name: str, term: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return an observation of Isaac Lab; raises `UsageError` for one that rlctl does not know."""
-    if "motion" in name or "anchor" in name:
-        raise UsageError(
-            f"{source}: observes {name}: it tracks a motion; only policies that follow velocity commands are imported"
-        )
+    refuse_motion(name, source)
     check_name(name, TERMS, f"{source}: no known observation is", UsageError, listed="It knows")
     part: dict[str, Any] = {"kind": TERMS[name], "history": max(1, term.get("history_length") or 1)}
     if term.get("scale") is not None:

@@ -15,7 +15,7 @@ from rlctl.task.mujoco.inverse_kinematics import solve
 from rlctl.task.mujoco.motors import MujocoMotors
 from rlctl.task.mujoco.parts import Parts
 from rlctl.task.mujoco.world import Array, Rows
-from rlctl.task.rotations import rotate, rotate_inverse
+from rlctl.task.rotations import cross, rotate, rotate_inverse
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.owner import BodyOwner
@@ -114,7 +114,7 @@ class MujocoBody(MujocoMotors):
         start = self.parts.free[1]
         velocity = self._fields.data("qvel")[..., start : start + 3]
         offset = rotate(self.base_orientation, self._fields.model("body_ipos")[..., self._base, :])
-        return velocity + np.cross(self.base_angular_velocity, offset)
+        return velocity + cross(self.base_angular_velocity, offset)
 
     @property
     def base_angular_velocity(self) -> Array:

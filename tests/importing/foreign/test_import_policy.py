@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from rlctl.errors import ArtifactError, RecipeError, UsageError
-from rlctl.importing.foreign.import_policy import import_policy
+from rlctl.importing.foreign.import_policy import import_policy, import_to_play
+from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.policy.load import load_policy
-from rlctl.task.deployment import Deployment
+from rlctl.task.deployment import TASK, Deployment
 from rlctl_locomotion.quadruped import JOINTS
 from tests.importing.foreign.policies import (
     A1,
@@ -82,7 +83,7 @@ def run_import(tmp_path, monkeypatch):
     def run(content, size, settings=None, name="deploy.yaml"):
         write_torchscript(tmp_path / "policy.pt", [size, 8, 12])
         deploy = write_yaml(tmp_path / name, content)
-        return import_policy(tmp_path / "policy.pt", deploy, A1, settings=settings)
+        return import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1), settings=settings)
 
     return run
 
@@ -147,8 +148,8 @@ def test_metadata_of_an_onnx_file(tmp_path, monkeypatch):
     }
     file = write_onnx(tmp_path / "policy.onnx", read_walk(), metadata=metadata)
     with pytest.raises(UsageError, match=r"does not say: control_dt\. Give --set control_dt=0.02"):
-        import_policy(file, None, A1)
-    deployment = import_policy(file, None, A1, settings={"control_dt": 0.02}).deployment
+        import_policy(file, ForeignFiles(None, A1))
+    deployment = import_policy(file, ForeignFiles(None, A1), settings={"control_dt": 0.02}).deployment
     assert deployment.action_scale == (0.25,) * 12
 
 
@@ -161,7 +162,7 @@ def test_a_policy_acts_as_in_its_own_project(tmp_path, monkeypatch):
     foreign["observations"][3]["scale"] = 2.0
     file = write_onnx(tmp_path / "policy.onnx", expect_as(network, foreign))
     deploy = write_yaml(tmp_path / "deploy.yaml", foreign)
-    import_policy(file, deploy, A1)
+    import_policy(file, ForeignFiles(deploy, A1))
     imported = load_policy(tmp_path / "policy.safetensors")
     observation = np.random.default_rng(0).normal(size=45).astype(np.float32)
     value = observation.astype(float)
@@ -201,6 +202,33 @@ def test_what_does_not_fit_is_a_line(run_import, content, size, settings, messag
     assert str(raised.value).count("\n") == 0
 
 
+@pytest.mark.parametrize("name", ["whole_body_tracking/motion_command", "RoboMimic_Deploy/phase"])
+def test_a_policy_of_rl_sar_that_tracks_a_motion(run_import, tmp_path, name):
+    folder = tmp_path / "a1" / "dance"
+    folder.mkdir(parents=True)
+    write_yaml(tmp_path / "a1" / "base.yaml", {"a1": {"dt": 0.005, "decimation": 4, "joint_names": JOINTS}})
+    content = {"a1/dance": SAR | {"observations": [name, *SAR["observations"]]}}
+    with pytest.raises(UsageError, match=f"observes {name}: it tracks a motion"):
+        run_import(content, 90, name="a1/dance/config.yaml")
+
+
+def test_an_imported_policy_is_not_trained_and_has_no_recipe(rlctl, tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    import_policy(
+        tmp_path / "policy.pt",
+        ForeignFiles(write_yaml(tmp_path / "deploy.yaml", describe_walk()), A1),
+        output=tmp_path / "policy.safetensors",
+    )
+    for arguments, message in (
+        (("train", "walk", "--from", "policy.safetensors"), "rlctl distill POLICY trains a student of it"),
+        (("train", TASK), "rlctl distill POLICY trains a student of it"),
+        (("export", "policy.safetensors", "--policy", "a.safetensors"), "the file itself is what to pass on"),
+    ):
+        result = rlctl(*arguments)
+        assert result.returncode in (2, 3)
+        assert message in result.stderr
+
+
 def test_tags_of_python_are_not_constructed(run_import, tmp_path):
     write_torchscript(tmp_path / "policy.pt", [48, 8, 12])
     text = write_yaml(tmp_path / "plain.yaml", LAB).read_text()
@@ -208,12 +236,14 @@ def test_tags_of_python_are_not_constructed(run_import, tmp_path):
     call = f"!!python/object/apply:os.mkdir ['{marker}']"
     (tmp_path / "deploy.yaml").write_text(UNTAGGED.sub(f"joint_ids: {call}", text))
     with pytest.raises(UsageError, match="the actions move some joints only"):
-        import_policy(tmp_path / "policy.pt", tmp_path / "deploy.yaml", A1, output=tmp_path / "a.safetensors")
+        import_policy(
+            tmp_path / "policy.pt", ForeignFiles(tmp_path / "deploy.yaml", A1), output=tmp_path / "a.safetensors"
+        )
     assert not marker.exists()
     tagged = UNTAGGED.sub("joint_ids: !!python/object/apply:builtins.slice [null, null, null]", text)
     (tmp_path / "deploy.yaml").write_text(tagged)
     deploy = tmp_path / "deploy.yaml"
-    imported = import_policy(tmp_path / "policy.pt", deploy, A1, output=tmp_path / "a.safetensors")
+    imported = import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1), output=tmp_path / "a.safetensors")
     assert imported.deployment.control_dt == 0.02
 
 
@@ -224,19 +254,19 @@ def test_anchors_and_large_files_are_refused(tmp_path):
     lines = [f"{name}: &{name} [*{before}, *{before}]" for before, name in itertools.pairwise(names)]
     bomb.write_text("\n".join(["a: &a [x, x]", *lines]))
     with pytest.raises(RecipeError, match="anchors and aliases make more than 100,000 values"):
-        import_policy(tmp_path / "policy.pt", bomb, A1)
+        import_policy(tmp_path / "policy.pt", ForeignFiles(bomb, A1))
     with (tmp_path / "large.yaml").open("wb") as file:
         file.truncate(10**9)
     with pytest.raises(ArtifactError, match="too large"):
-        import_policy(tmp_path / "policy.pt", tmp_path / "large.yaml", A1)
+        import_policy(tmp_path / "policy.pt", ForeignFiles(tmp_path / "large.yaml", A1))
 
 
 def test_other_files_are_refused(tmp_path):
     with pytest.raises(UsageError, match="is an ONNX"):
-        import_policy(tmp_path / "policy.zip", None, A1)
+        import_policy(tmp_path / "policy.zip", ForeignFiles(None, A1))
     write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
     with pytest.raises(UsageError, match="--model: MuJoCo cannot load"):
-        import_policy(tmp_path / "policy.pt", None, "kuka_iiwa.urdf")
+        import_policy(tmp_path / "policy.pt", ForeignFiles(None, "kuka_iiwa.urdf"))
 
 
 def test_the_command_names_what_it_needs(rlctl, tmp_path):
@@ -253,3 +283,39 @@ def test_the_command_names_what_it_needs(rlctl, tmp_path):
     result = rlctl("runs", "import", "policy.pt", "--deploy", "deploy.yaml", "--model", A1)
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("policy.safetensors: 12 joints, from deployment of rlctl")
+
+
+def test_one_command_imports_and_plays(rlctl, tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    write_yaml(tmp_path / "deploy.yaml", describe_walk())
+    files = ("--deploy", "deploy.yaml", "--model", A1)
+    first = rlctl("eval", "policy.pt", *files, "--episodes", "1", "--set", "task.tolerance=0.2")
+    assert first.returncode == 0, first.stderr
+    assert "policy file policy.safetensors, from deployment of rlctl" in first.stderr
+    assert "Deployed: policy.safetensors" in first.stdout
+
+
+def test_an_import_to_play_keeps_what_is_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    files = ForeignFiles(write_yaml(tmp_path / "deploy.yaml", describe_walk()), A1)
+    settings = ["task.tolerance=0.2", "control_dt=0.01", "randomize=true"]
+    assert import_to_play("policy.pt", files, []) == ("policy.safetensors", [])
+    assert import_to_play("policy.pt", files, settings) == (
+        "policy-2.safetensors",
+        ["task.tolerance=0.2", "randomize=true"],
+    )
+    assert import_to_play("policy.pt", files, []) == ("policy.safetensors", [])
+    assert import_to_play("policy.pt", files, settings)[0] == "policy-2.safetensors"
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [
+        "policy-2.safetensors",
+        "policy.safetensors",
+    ]
+
+
+def test_files_of_another_project_exclude_baselines(rlctl):
+    result = rlctl("replay", "walk", "--policy", "zero", "--model", A1)
+    assert (result.returncode, result.stderr.strip()) == (
+        2,
+        "error: --policy zero plays a task: leave out --deploy, --model and --terrain",
+    )

@@ -7,7 +7,7 @@ from onnx import helper
 
 from rlctl.errors import ArtifactError
 from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork
-from rlctl.importing.foreign.onnx_network import compute, read_onnx
+from rlctl.importing.foreign.onnx_network import compute, read_onnx, step_lstm
 from rlctl.importing.foreign.torchscript import read_torchscript_network
 from tests.importing.foreign.policies import Concatenated, write_onnx, write_torchscript
 
@@ -54,19 +54,45 @@ def test_the_means_of_a_distribution_are_what_acts(network, tmp_path):
         ({"extra": [helper.make_node("Fancy", ["y1"], ["actions"], domain="their.own")]}, "custom operator Fancy"),
         ({"extra": [helper.make_node("Softmax", ["y1"], ["actions"])]}, "the operator Softmax"),
         ({"extra": [helper.make_node("Add", ["y1", "y1"], ["actions"])]}, "joins two branches with Add"),
-        (
-            {
-                "inputs": [("obs", [1, 5]), ("h_in", [1, 1, 4])],
-                "extra": [helper.make_node("LSTM", ["y1"], ["actions"])],
-            },
-            r"hidden states \(LSTM; inputs obs, h_in\)",
-        ),
+        ({"extra": [helper.make_node("GRU", ["y1", "y1", "y1"], ["actions"])]}, r"hidden states \(GRU\)"),
     ],
 )
 def test_graphs_that_are_no_perceptron_are_a_line(network, tmp_path, change, message):
     with pytest.raises(ArtifactError, match=message) as raised:
         read_onnx(write_onnx(tmp_path / "a.onnx", network, **change))
     assert "\n" not in str(raised.value)
+
+
+class RecurrentExporter(torch.nn.Module):
+    """A policy with hidden states as rsl_rl and Isaac Lab export it."""
+
+    def __init__(self):
+        super().__init__()
+        self.rnn = torch.nn.LSTM(5, 8, 1)
+        self.actor = torch.nn.Sequential(torch.nn.Linear(8, 4), torch.nn.ELU(), torch.nn.Linear(4, 2))
+
+    def forward(self, obs, h_in, c_in):
+        """Normalise, then act."""
+        value, (hidden, cell) = self.rnn(((obs - 0.5) / 2.0).unsqueeze(0), (h_in, c_in))
+        return self.actor(value.squeeze(0)), hidden, cell
+
+
+def test_an_onnx_graph_with_hidden_states(tmp_path):
+    torch.manual_seed(0)
+    module, path = RecurrentExporter(), tmp_path / "a.onnx"
+    state = torch.zeros(1, 1, 8)
+    given, results = ["obs", "h_in", "c_in"], ["actions", "h_out", "c_out"]
+    torch.onnx.export(
+        module, (torch.zeros(1, 5), state, state), str(path), input_names=given, output_names=results, dynamo=False
+    )
+    network, _ = read_onnx(path)
+    assert (network.observation_size, network.action_size, network.algo) == (5, 2, "recurrent_ppo")
+    own, hidden, cell = np.zeros((2, 8)), state, state
+    for row in np.random.default_rng(1).normal(size=(3, 5)):
+        own = step_lstm(network.lstm, row, own)
+        with torch.no_grad():
+            expected, hidden, cell = module(torch.tensor(row[None], dtype=torch.float32), hidden, cell)
+        assert compute(network, own[0]) == pytest.approx(expected[0].numpy(), abs=1e-5)
 
 
 def test_text_is_no_graph(tmp_path):
@@ -110,6 +136,57 @@ def test_torchscript_that_does_more_is_refused_with_the_way_to_onnx(tmp_path):
     write_torchscript(tmp_path / "a.pt", [10, 8, 2], kind=Concatenated)
     with pytest.raises(ArtifactError, match=r"its forward calls cat; .*torch\.onnx\.export"):
         read_torchscript_network(tmp_path / "a.pt")
+
+
+def write_graph(path, *, skips=False):
+    """Write a perceptron as torch.fx makes it of an ONNX file: a graph whose parts are called one after the other."""
+    torch.manual_seed(0)
+    parts = {"a/0/Gemm": torch.nn.Linear(5, 4), "a/1/Elu": torch.nn.ELU(), "a/2/Gemm": torch.nn.Linear(4, 2)}
+    graph = torch.fx.Graph()
+    value = graph.placeholder("input_1")
+    for name in parts:
+        value = graph.call_module(name, (value,))
+    if skips:
+        value = graph.call_method("neg", (value,))
+    graph.output(value)
+    module = torch.fx.GraphModule(parts, graph)
+    torch.jit.script(module).save(str(path))
+    return module
+
+
+def test_torchscript_of_a_graph_is_a_chain_of_calls(tmp_path):
+    module = write_graph(tmp_path / "a.pt")
+    row = np.linspace(-1.0, 1.0, 5)
+    with torch.no_grad():
+        expected = module(torch.tensor(row[None], dtype=torch.float32))[0].numpy()
+    assert compute(read_torchscript_network(tmp_path / "a.pt"), row) == pytest.approx(expected, abs=1e-5)
+    write_graph(tmp_path / "a.pt", skips=True)
+    with pytest.raises(ArtifactError, match="its graph is no chain of layers"):
+        read_torchscript_network(tmp_path / "a.pt")
+
+
+def test_an_estimator_beside_the_perceptron_is_not_played(tmp_path):
+    class Estimating(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.actor = torch.nn.Sequential(torch.nn.Linear(8, 2))
+            self.estimator = torch.nn.Sequential(torch.nn.Linear(5, 3))
+
+        def forward(self, x: torch.Tensor) -> torch.Tensor:
+            return self.actor(torch.cat([x, self.estimator(x)], 1))
+
+    torch.jit.script(Estimating()).save(str(tmp_path / "a.pt"))
+    with pytest.raises(ArtifactError, match=r"a\.pt: it estimates what it does not observe \(HIMLoco\)") as raised:
+        read_torchscript_network(tmp_path / "a.pt")
+    assert "torch.onnx.export" not in str(raised.value)
+
+
+@pytest.mark.parametrize(("name", "read"), [("a.onnx", read_onnx), ("a.pt", read_torchscript_network)])
+def test_a_file_of_a_gigabyte_is_not_read(tmp_path, name, read):
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(10**9)
+    with pytest.raises(ArtifactError, match=rf"{name}: .*too large"):
+        read(tmp_path / name)
 
 
 def test_weights_alone_are_no_network(tmp_path):
