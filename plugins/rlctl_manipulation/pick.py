@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
+from rlctl.task import BatchTask, Box, Camera, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
 from rlctl.task.rotations import from_axis, rotate
 
 MODELS = Path(__file__).with_name("models")
@@ -63,6 +63,12 @@ class Pick(BatchTask):
     observation_terms = {
         "to_block": terms.Displacement("block", "grasp"),
         "to_goal": terms.Displacement("goal", "grasp"),
+    }
+    cameras = {  # a student of `rlctl distill` may observe their pictures
+        "camera": Camera(eye=(1.2, 0.0, 0.65), target=(0.5, 0.0, 0.08), field_of_view=40.0),
+        "wrist_camera": Camera(
+            eye=(0.08, 0.0, 0.0), target=(0.0, 0.0, 0.12), up=(-1.0, 0.0, 0.0), body="arm", link="hand", field_of_view=75.0
+        ),
     }
     reward_weights = {
         "approach": 0.1,

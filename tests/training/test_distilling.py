@@ -81,7 +81,7 @@ def run(tmp_path, monkeypatch):
 
 
 def test_the_oldest_steps_are_replaced(monkeypatch):
-    monkeypatch.setattr(labelled_steps, "_MOST_BYTES", 50)  # two additions of 24 bytes
+    monkeypatch.setattr(labelled_steps, "MOST_BYTES", 50)  # two additions of 24 bytes
     steps = LabelledSteps()
     for number in range(4):
         steps.add({"label": np.full((3, 2), number, np.float32)})
