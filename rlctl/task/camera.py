@@ -15,6 +15,9 @@ from rlctl.task.rotations import normalize, rotate
 Point = tuple[float, float, float]
 Pictures = NDArray[np.uint8]
 
+Shape = Literal["box", "ball", "cylinder"]
+
+SHAPES: tuple[Shape, ...] = ("box", "ball", "cylinder")
 LARGEST_SIDE = 1024  # [pixels]
 _PARALLEL = 1e-6
 
@@ -49,9 +52,9 @@ class Camera:
 class Distractor:
     """A thing that cameras see and nothing touches: a box, a ball or a cylinder, upright."""
 
-    shape: Literal["box", "ball", "cylinder"]
+    shape: Shape
     position: Sequence[float]  # [m], of its middle
-    size: Sequence[float]  # [m], half of its sides; of a ball the first is the radius, of a cylinder the last is height
+    size: Sequence[float]  # [m], half of its sides; all of a ball are its radius, the first of a cylinder too
     yaw: float  # [rad]
     color: Sequence[float]  # red, green, blue
 

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.task.camera import Camera, Distractor, Pictures
+from rlctl.task.camera import SHAPES, Camera, Distractor, Pictures
 from rlctl.task.mujoco.drawn_world import DrawnWorld
 from rlctl.task.mujoco.opengl import draw_without_display, explain_failure
 from rlctl.task.mujoco.scene import MujocoScene
 from rlctl.task.mujoco.world import Array, MujocoWorld
 from rlctl.task.rotations import from_axis, rotate
 
-SHAPES = ("box", "ball", "cylinder")
 MOST_DISTRACTORS = 8
 _SUN = (-0.3, 0.4, -0.85)  # the direction of the light
 _AMBIENT, _DIFFUSE = 0.45, 0.6
