@@ -160,7 +160,7 @@ def test_only_what_is_named_is_drawn(make_worlds):
     assert not worlds.sim._camera_pictures
     seen = make_worlds(2, observing=Observing(["front"]))
     assert seen.observation_space["front"] == spaces.Box(0, 255, (24, 32, 3), np.uint8)
-    with pytest.raises(RecipeError, match="no observation 'frnt'. Did you mean 'front'"):
+    with pytest.raises(RecipeError, match=r"no observation 'frnt'\. Did you mean 'front'"):
         make_worlds(1, observing=Observing(["frnt"]))
 
 

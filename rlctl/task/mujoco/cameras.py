@@ -54,7 +54,7 @@ class CameraPictures:
         self._cameras = cameras
         for setting, value in _CORNERS.items():
             setattr(scene.spec.visual.quality, setting, value)
-        largest = [max((camera.size[axis] for camera in cameras.values())) for axis in (0, 1)]
+        largest = [max(camera.size[axis] for camera in cameras.values()) for axis in (0, 1)]
         scene.spec.visual.global_.offwidth, scene.spec.visual.global_.offheight = largest
         self._drawn = DrawnWorld(scene)
         self._renderers: dict[tuple[int, int], Any] = {}  # by size: a new one takes half a second

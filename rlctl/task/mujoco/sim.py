@@ -15,8 +15,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.task.attachments import Attachment, Joined
 from rlctl.errors import TaskError
+from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.camera import Distractor, Pictures
 from rlctl.task.mujoco.body import MujocoBody
 from rlctl.task.mujoco.cameras import MOST_DISTRACTORS, CameraPictures, as_row, make_looks
