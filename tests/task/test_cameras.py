@@ -15,7 +15,7 @@ from rlctl.task.mujoco.cameras import MOST_DISTRACTORS
 from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.observation import Observing
 from rlctl.task.worlds import TaskWorlds
-from tests.task.batches import Stool
+from tests.task.batches import SeenStool
 from tests.task.tasks import Cart
 
 pytest.importorskip("mujoco")
@@ -24,24 +24,6 @@ needs_egl = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="
 RED = (1.0, 0.0, 0.0)
 LOOKS = {"light": {}, "color": {}, "pose": {}, "things": {}}
 SEEN = Observing(["front", "seat", "hips"])
-
-
-class SeenStool(Stool):
-    """The stool before a camera that stands still, and with one on its seat."""
-
-    cameras = {
-        "front": Camera(eye=(1.0, 0.0, 0.3), target=(0.0, 0.0, 0.3), size=(32, 24)),
-        "seat": Camera(eye=(0.0, 0.0, 0.1), target=(0.5, 0.0, 0.0), body="stool", size=(16, 16)),
-    }
-    events = {
-        **Stool.events,
-        "light": Event("reset", events.set_light, brightness=(0.5, 1.5), azimuth=(-180, 180), elevation=(20, 90)),
-        "color": Event("reset", events.set_color, body="stool", red=(0, 1), green=(0, 1), blue=(0, 1)),
-        "pose": Event("reset", events.move_camera, camera="front", shift=(-0.05, 0.05), turn=(-3, 3)),
-        "things": Event(
-            "reset", events.set_distractors, count=(1, 3), center=(0, 0, 0), distance=(0.2, 0.4), size=(0.02, 0.05)
-        ),
-    }
 
 
 @pytest.fixture
@@ -131,7 +113,7 @@ def test_pictures_depend_on_the_seed_only(make_worlds):
     many.reset(np.arange(3), [1, 2, 3])
     many.step(actions[0])
     seen = [many.reset(np.arange(3), seeds)] + [many.step(action).observation for action in actions]
-    assert seen[0]["front"].shape == (3, 24, 32, 3)
+    assert seen[0]["front"].shape == (3, 36, 40, 3)
     for world, seed in enumerate(seeds):
         alone = [one.reset(np.zeros(1, int), [seed])]
         alone += [one.step(action[world : world + 1]).observation for action in actions]
@@ -148,7 +130,7 @@ def test_some_worlds_begin_again_while_others_play(make_worlds):
     first = worlds.reset(np.arange(3), [5, 6, 7])
     worlds.step(np.zeros((3, 2)))
     again = worlds.reset(np.array([2]), [7])
-    assert again["front"].shape == (1, 24, 32, 3)
+    assert again["front"].shape == (1, 36, 40, 3)
     np.testing.assert_array_equal(again["front"][0], first["front"][2])
 
 
@@ -159,7 +141,7 @@ def test_only_what_is_named_is_drawn(make_worlds):
     worlds.reset(np.arange(2), [1, 2])
     assert not worlds.sim._camera_pictures
     seen = make_worlds(2, observing=Observing(["front"]))
-    assert seen.observation_space["front"] == spaces.Box(0, 255, (24, 32, 3), np.uint8)
+    assert seen.observation_space["front"] == spaces.Box(0, 255, (36, 40, 3), np.uint8)
     with pytest.raises(RecipeError, match=r"no observation 'frnt'\. Did you mean 'front'"):
         make_worlds(1, observing=Observing(["frnt"]))
 
@@ -222,7 +204,7 @@ def test_a_task_in_pybullet_has_cameras_and_no_lights():
 
     worlds = TaskWorlds(SeenCart(), observing=Observing(["side", "cube"]))
     first = worlds.reset(np.zeros(1, int), [0])["side"]
-    assert first.shape == (1, 24, 32, 3)
+    assert first.shape == (1, 36, 40, 3)
     with pytest.raises(UsageError, match="set_light: not in PyBullet"):
         worlds.sim.set_light(1.0, (0, 0, -1))
     worlds.close()
