@@ -8,6 +8,7 @@ the corners of shapes.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -60,17 +61,14 @@ class CameraPictures:
         self._renderers: dict[tuple[int, int], Any] = {}  # by size: a new one takes half a second
         self._free = self._mujoco.MjvCamera()
         self._numbers = {name: number for number, name in enumerate(cameras)}
-        self._mounts = {name: self._find_mount(camera) for name, camera in cameras.items()}
+        self._mounts = {name: self._find_mount(camera, scene) for name, camera in cameras.items()}
 
-    def _find_mount(self, camera: Camera) -> int:
+    def _find_mount(self, camera: Camera, scene: MujocoScene) -> int:
         """Return the number of the MuJoCo body that carries a camera; 0 is the world."""
-        model = self._drawn.model
         if not camera.body:
             return 0
-        if camera.link:
-            return int(model.body(f"{camera.body}/{camera.link}").id)
-        names = (model.body(number).name for number in range(model.nbody))
-        return next(number for number, name in enumerate(names) if name.startswith(f"{camera.body}/"))
+        link = camera.link or scene.parts[camera.body].base_name
+        return int(self._drawn.model.body(f"{camera.body}/{link}").id)
 
     def take(self, name: str, world: MujocoWorld, rows: Array) -> Pictures:
         """Return what a camera sees in some worlds of a batch, shape (k, height, width, 3); raises `UsageError`."""
@@ -91,6 +89,8 @@ class CameraPictures:
     def _find_renderer(self, size: tuple[int, int]) -> Any:
         if size not in self._renderers:
             draw_without_display()
+            # Mesa's threads take longer to begin a small picture than they save, and the cores are for the workers.
+            os.environ.setdefault("LP_NUM_THREADS", "0")
             renderer = self._mujoco.Renderer(self._drawn.model, size[1], size[0], max_geom=1000)
             for flag in ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_HAZE", "mjRND_FOG"):
                 renderer.scene.flags[int(getattr(self._mujoco.mjtRndFlag, flag))] = 0

@@ -198,7 +198,7 @@ class MujocoSim(Sim):
                     roll[number] = parts.file.roll.get(link, 0.0)
         self.world.extra |= {"friction": friction, "spin": spin, "roll": roll}
         self.world.extra["ideal motors"] = make_ideal_motors(model.nu)
-        self.world.extra |= make_looks(self.cameras)
+        self.world.extra = make_looks(self.cameras) | self.world.extra  # what `build` has set so far stays
         strength = np.ones(model.nu)
         color = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
         if "color" in self.world.extra:  # what a task has changed in `build` so far
