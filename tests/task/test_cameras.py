@@ -204,7 +204,7 @@ def test_a_task_in_pybullet_has_cameras_and_no_lights():
 
     worlds = TaskWorlds(SeenCart(), observing=Observing(["side", "cube"]))
     first = worlds.reset(np.zeros(1, int), [0])["side"]
-    assert first.shape == (1, 36, 40, 3)
+    assert first.shape == (1, 24, 32, 3)
     with pytest.raises(UsageError, match="set_light: not in PyBullet"):
         worlds.sim.set_light(1.0, (0, 0, -1))
     worlds.close()
