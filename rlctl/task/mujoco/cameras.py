@@ -1,8 +1,8 @@
 """What the cameras of a task see in MuJoCo, of one world or of each world of a batch, drawn one after the other.
 
 Pictures are small and many, so they are drawn coarsely: round shapes have few corners, edges are not smoothed, one
-light gives no shadow. A picture takes about 1 ms of a core without a graphics card, at 64 x 64 pixels hardly more than at
-32 x 32; with twice the corners half as much again, with smooth edges three times as much.
+light gives no shadow. A picture takes about 1 ms of a core without a graphics card, at 64 x 64 pixels hardly more than
+at 32 x 32; with twice the corners half as much again, with smooth edges three times as much.
 """
 
 from __future__ import annotations
