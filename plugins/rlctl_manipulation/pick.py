@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
+from rlctl.task import BatchTask, Box, Camera, CommandTerm, Event, Joints, Sim, WorldRngs, events, rewards, terms
 from rlctl.task.rotations import from_axis, rotate
 
 MODELS = Path(__file__).with_name("models")
@@ -64,6 +64,17 @@ class Pick(BatchTask):
         "to_block": terms.Displacement("block", "grasp"),
         "to_goal": terms.Displacement("goal", "grasp"),
     }
+    cameras = {  # a student of `rlctl distill` may observe their pictures
+        "camera": Camera(eye=(1.2, 0.0, 0.65), target=(0.5, 0.0, 0.08), field_of_view=40.0),
+        "wrist_camera": Camera(
+            eye=(0.08, 0.0, 0.0),
+            target=(0.0, 0.0, 0.12),
+            up=(-1.0, 0.0, 0.0),
+            body="arm",
+            link="hand",
+            field_of_view=75.0,
+        ),
+    }
     reward_weights = {
         "approach": 0.1,
         "grasp": 0.2,
@@ -83,6 +94,23 @@ class Pick(BatchTask):
         "block_noise": Event("observation", events.noise, of="to_block", std=(0.0, 0.003)),  # [m], of a camera
         "observation_delay": Event("observation", events.delay, steps=(0, 1)),  # of 40 ms
         "action_delay": Event("action", events.delay, steps=(0, 1)),
+        # Of appearance, for cameras.
+        "block_color": Event("reset", events.set_color, body="block", red=(0.6, 1), green=(0, 0.5), blue=(0, 0.4)),
+        "arm_color": Event("reset", events.set_color, body="arm", red=(0.2, 1), green=(0.2, 1), blue=(0.2, 1)),
+        "table_color": Event("reset", events.set_color, body="table", red=(0.3, 1), green=(0.3, 1), blue=(0.3, 1)),
+        "light": Event("reset", events.set_light, brightness=(0.6, 1.3), azimuth=(-180, 180), elevation=(35, 90)),
+        "camera_pose": Event("reset", events.move_camera, camera="camera", shift=(-0.02, 0.02), turn=(-2, 2)),
+        "wrist_camera_pose": Event(
+            "reset", events.move_camera, camera="wrist_camera", shift=(-0.005, 0.005), turn=(-2, 2)
+        ),
+        "distractors": Event(
+            "reset",
+            events.set_distractors,
+            count=(0, 4),
+            center=(0.52, 0.0, 0.0),
+            distance=(0.3, 0.6),
+            size=(0.015, 0.05),
+        ),
     }
     rlctl_ignore = {
         "RL611": "a grasp takes a second of good steering; tests/manipulation has one by a script",

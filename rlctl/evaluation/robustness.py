@@ -17,7 +17,7 @@ from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
 from rlctl.errors import UsageError, check_name, did_you_mean, short_repr
 from rlctl.policy.shipped import Interval
 from rlctl.storage import untrusted
-from rlctl.task.events import Event, RangeLimits, set_color
+from rlctl.task.events import OF_APPEARANCE, Event, RangeLimits
 from rlctl.task.events.event import read_range
 
 FORMAT = 1
@@ -298,8 +298,9 @@ def _is_whole(declared: inspect.Parameter, values: Sequence[float]) -> bool:
 def _vary_all(task: Any, spec: EnvSpec) -> list[Axis]:
     if not is_task(task) or not task.events:
         raise UsageError(f"--vary all: {spec.task} has no events; name one of its parameters")
-    # Colours matter only to policies that use a camera; name the event to vary it.
-    events = {name: event for name, event in task.events.items() if event.ranges and event.function is not set_color}
+    events = {name: event for name, event in task.events.items() if event.ranges}
+    if not set(spec.observe) & set(task.cameras):  # looks matter only to policies that see by a camera
+        events = {name: event for name, event in events.items() if event.function not in OF_APPEARANCE}
     spans = {name: _widen(event) for name, event in events.items()}
     return [
         _vary_event(name, name, "", event, spans[name], spec)

@@ -124,7 +124,7 @@ class Recipe(Section):
     frame_stack: Whole = Field(1, ge=1, le=1000)
     """Number of latest observations that the policy gets, stacked."""
     observe: list[str] = []
-    """What the policy observes, by names of the task's `observe` or `privileged`; empty: all of `observe`."""
+    """What the policy observes, by names of the task's `observe`, `privileged` or cameras; empty: all of `observe`."""
     observation_history: dict[str, Annotated[Whole, Field(ge=1, le=1000)]] = {}
     """Number of last values of observations that become histories, by name; `frame_stack` stacks all."""
     time_feature: Switch = False

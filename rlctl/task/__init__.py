@@ -13,6 +13,7 @@ from rlctl.task.attachments import Attachment as Attachment
 from rlctl.task.batch import BatchTask as BatchTask
 from rlctl.task.batch import WorldRngs as WorldRngs
 from rlctl.task.body import Body as Body
+from rlctl.task.camera import Camera as Camera
 from rlctl.task.commands import CommandTerm as CommandTerm
 from rlctl.task.events import Event as Event
 from rlctl.task.joints import Joints as Joints

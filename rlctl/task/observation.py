@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,13 +28,16 @@ class Observing:
     """What a policy observes of a task; without names, all that the task's `observe` returns."""
 
     names: Sequence[str] = ()
-    """Names of what `observe` or `privileged` returns."""
+    """Names of what `observe` or `privileged` returns, and of cameras."""
     history: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Numbers of last values by name, which replace the task's own."""
 
-    def list_names(self, task: str, observed: Mapping[str, Any], privileged: Mapping[str, Any]) -> list[str]:
-        """Return the names in the order of the task; raises `RecipeError` for a name that it does not have."""
-        known = [*observed, *(name for name in privileged if name not in observed)]
+    def list_names(self, task: str, observed: Mapping[str, Any], others: Iterable[str]) -> list[str]:
+        """Return the names in the order of the task; raises `RecipeError` for a name that it does not have.
+
+        `others`, of cameras and of what is privileged, are observed only if they are named.
+        """
+        known = list(dict.fromkeys([*observed, *others]))
         for name in self.names:
             check_name(name, known, f"observe: {task} has no observation", RecipeError, listed="It has")
         return [name for name in known if name in self.names] or list(observed)
@@ -77,13 +80,16 @@ class View:
     ) -> None:
         """`observed` and `privileged` are examples of what the task's methods return for one world."""
         self._name = type(task).__name__
-        self._is_dict = task.observation_layout == "dict"
         if not isinstance(privileged, dict):
             privileged = {}
-        names = observing.list_names(self._name, observed, privileged)
-        self.privileged = [name for name in names if name not in observed]
+        pictures = {name: np.zeros(camera.shape, np.uint8) for name, camera in task.cameras.items()}
+        names = observing.list_names(self._name, observed, [*pictures, *privileged])
+        self.cameras = [name for name in names if name in pictures]
+        """The cameras that it sees by."""
+        self.privileged = [name for name in names if name not in observed and name not in pictures]
         """What it sees of what `privileged` returns."""
-        examples = {**privileged, **observed}
+        self._is_dict = task.observation_layout == "dict" or bool(self.cameras)
+        examples = {**privileged, **pictures, **observed}
         first = {name: examples[name] for name in names}
         self.frames = observing.find_frames(task, names)
         """The number of last values of those that are histories."""
@@ -92,7 +98,7 @@ class View:
                 raise TaskError(
                     f"{self._name}: observation_history of {name!r}, of shape {shape}: only vectors have one"
                 )
-        self._names = names if observing.names else None
+        self._names = names if observing.names or pictures else None
         self._history = TermHistory(worlds, self.frames, task.history_start) if self.frames else None
         self._single_shapes = {name: np.shape(value) for name, value in first.items()}
         self._shapes = {name: self._find_shape(name, value) for name, value in first.items()}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.body import Array, Body
+from rlctl.task.camera import Camera, Distractor, Pictures, locate
 
 
 class Sim:
@@ -25,6 +26,8 @@ class Sim:
     engine: ClassVar[str]
     """Name of the physics engine, for people."""
     bodies: Mapping[str, Body]
+    cameras: Mapping[str, Camera]
+    """The cameras that the task declares, by name."""
 
     def _refuse(self, what: str) -> NoReturn:
         raise UsageError(f"{what}: not in {self.engine}; use the other engine: --sim")
@@ -152,6 +155,34 @@ class Sim:
         The camera is at `eye` [m] and looks at `target` [m], with a vertical `field_of_view` [degrees].
         """
         self._refuse("render")
+
+    def take_pictures(self, camera: str, worlds: NDArray[np.int64] | None = None) -> Pictures:
+        """Return what a camera of the task sees in some worlds, by default all, shape (k, height, width, 3).
+
+        Markers are not in the pictures of MuJoCo. Events may have changed colours, light and the camera's pose.
+        """
+        chosen = self.find_camera(camera)
+        (width, height), (eye, axes) = chosen.size, locate(chosen, self.bodies)
+        view = {"eye": eye.tolist(), "target": (eye + axes[2]).tolist(), "up": axes[1].tolist()}
+        return self.render(width, height, field_of_view=chosen.field_of_view, **view)[None]
+
+    def find_camera(self, name: str) -> Camera:
+        """Return a camera of the task; raises `TaskError` for a name that it does not declare."""
+        check_name(name, self.cameras, "no camera", TaskError, listed="Declared")
+        return self.cameras[name]
+
+    def set_light(self, brightness: float, direction: Sequence[float]) -> None:
+        """Light the cameras' pictures from a direction, `brightness` times as bright as usual, until the next reset."""
+        self._refuse("set_light")
+
+    def move_camera(self, camera: str, shift: Sequence[float], turn: Sequence[float]) -> None:
+        """Move a camera from its declared pose until the next reset: along its axes right, up and forward by `shift`
+        [m], and about them by `turn` [rad]."""
+        self._refuse("move_camera")
+
+    def set_distractors(self, distractors: Sequence[Distractor]) -> None:
+        """Show so many things, at most 8, in the cameras' pictures until the next reset; nothing touches them."""
+        self._refuse("set_distractors")
 
     def close(self) -> None:
         """End the simulation; a second call does nothing."""

@@ -10,6 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
+from rlctl.task.camera import Camera, check_cameras
 from rlctl.task.commands import CommandTerm
 from rlctl.task.events import Event
 from rlctl.task.history import Start
@@ -51,6 +52,9 @@ class TaskDefinition:
     """Unit by name, also of the quantities of `observation_terms`."""
     observation_bounds: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Range per observation name, in its unit; other observations are unbounded."""
+    cameras: ClassVar[Mapping[str, Camera]] = {}
+    """Cameras whose pictures a policy may observe: it names them in the recipe's key `observe`, and they are drawn only
+    then. The observation is a Dict space with one entry per name."""
     reward_weights: ClassVar[Mapping[str, float]] = {}
     """Weight per reward term; a term with weight 0 is a metric."""
     mirror: ClassVar[Declaration] = {}
@@ -218,6 +222,7 @@ def check_definition(task: TaskDefinition) -> None:
             )
     if task.history_start not in ("first", "zeros"):
         raise TaskError(f"{name}: history_start is {task.history_start!r}; it must be 'first' or 'zeros'")
+    check_cameras(name, task.cameras)
     for key, event in task.events.items():
         if not isinstance(event, Event):
             raise TaskError(f"{name}: events.{key} is not an Event: Event('reset', scale_mass, body=...), for example")

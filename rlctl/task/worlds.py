@@ -14,6 +14,7 @@ from rlctl.engine import MUJOCO, PYBULLET, Engine
 from rlctl.errors import RecipeError, TaskError, UsageError, WorldFailed, check_name, in_world
 from rlctl.task.batch import BatchTask
 from rlctl.task.calls import Array, Flags, ManyWorldCalls, OneWorldCalls, TaskCalls, Worlds
+from rlctl.task.camera import locate
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
 from rlctl.task.events.event import Drawn
@@ -133,6 +134,7 @@ class TaskWorlds:
         self.after_physics: Callable[[], None] | None = None
         """Called after the physics of each step, before anything is judged: it may place bodies."""
         self.sim: Any = _make_sim(task, count, sim, render_mode, visuals=visuals)
+        self.sim.cameras = task.cameras
         try:
             self._set_up(events or EventSettings(), observing, has_markers=render_mode is not None)
         except BaseException:
@@ -145,14 +147,18 @@ class TaskWorlds:
         self._acting = ActingEvents(self.events, self.task.control_dt)
         self._build()
         one, first_world = self.sim_of(0), np.zeros(1, np.int64)
+        for camera in self.task.cameras.values():
+            locate(camera, one.bodies)
         drawn = self._acting.try_once(["reset"], one)
         self.calls.reset([np.random.default_rng(0)], first_world)
         drawn |= self._acting.try_once(["start", "interval"], one)
         observed = self._compute_terms(self.calls.observe())
         self.calls.check_kept("reset")
         self._first = {name: value[0] for name, value in observed.items()}
+        cameras = self.task.cameras.items()
+        self._pictures = {name: np.zeros(c.shape, np.uint8) for name, c in cameras if name in observing.names}
         self._signals = self._make_signals(self.events)
-        drawn |= self._signals.try_once(self._first)
+        drawn |= self._signals.try_once({**self._first, **self._pictures})
         privileged = self.calls.privileged()
         if isinstance(privileged, dict):
             privileged = {name: value[0] for name, value in privileged.items()}
@@ -188,7 +194,8 @@ class TaskWorlds:
         return View(self.task, self.count, observing, self._first, self._privileged_examples)
 
     def _make_signals(self, events: Mapping[str, Any]) -> Signals:
-        return Signals(self.count, events, self._first, self.action_space, self.task.observation_bounds)
+        first = {**self._first, **self._pictures}
+        return Signals(self.count, events, first, self.action_space, self.task.observation_bounds)
 
     def show_teacher(self, observing: Observing, events: EventSettings) -> TeacherSight:
         """Observe for a teacher with its own `events` too, from the next reset on; `RecipeError` for wrong names."""
@@ -476,6 +483,7 @@ class TaskWorlds:
         exact = self._compute_terms(self.calls.observe())
         if worlds is not self._all:
             exact = {name: value[worlds] for name, value in exact.items()}
+        exact |= {name: self.sim.take_pictures(name, worlds) for name in self._seen_cameras}
         seen = self._signals.observe(exact, worlds)
         try:
             if self.teacher is not None:
@@ -486,6 +494,13 @@ class TaskWorlds:
             return self.view.assemble(seen, worlds)
         except WrongRow as wrong:
             self._fail(worlds[wrong.row], str(wrong))
+
+    @property
+    def _seen_cameras(self) -> list[str]:
+        """The cameras by which the policy or the teacher sees."""
+        if self.teacher is None:
+            return self.view.cameras
+        return list(dict.fromkeys([*self.view.cameras, *self.teacher.view.cameras]))
 
     def _read_privileged(self, view: View, worlds: Worlds) -> dict[str, Any]:
         if not view.privileged:

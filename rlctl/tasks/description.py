@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
 from pydantic_core import to_jsonable_python
 
 from rlctl.environments import installed, registry
@@ -120,6 +121,10 @@ def _describe_definition(env: TaskEnv) -> dict[str, Any]:
         "has_success": env.has_success,
         "action_meaning": task.action_meaning,
         "observation_layout": task.observation_layout,
+        "cameras": {
+            name: {"size": list(camera.size), "body": camera.body or None, "link": camera.link or None}
+            for name, camera in task.cameras.items()
+        },
         "rewards": [
             {"name": name, "weight": weight, "default": float(task.reward_weights[name])}
             for name, weight in env.reward_weights.items()
@@ -197,7 +202,7 @@ def _format_space(space: Any) -> str:
 def _list_observations(env: TaskEnv) -> list[dict[str, Any]]:
     units = env.task.observation_units
     parts = _list_quantities(env.observation_space)
-    if env.task.observation_layout == "flat":
+    if not isinstance(env.observation_space, spaces.Dict):
         (whole,) = find_leaves(env.observation_space)
         parts, start = [], 0
         for name, size in env.observation_sizes.items():

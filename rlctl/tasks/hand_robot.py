@@ -34,6 +34,8 @@ _LONGEST, _BIGGEST_MESH = 20.0, 5.0  # [m], of an arm; of the reach, of a link's
 _FASTEST = {False: 1.2, True: 0.25}  # [rad/s], and [m/s] of joints that slide
 _REACH = 0.85  # [m], of the arm for which the reward's lengths were chosen
 _IN_TABLE = 1e-3  # [m]
+_CAMERA_AWAY, _CAMERA_HEIGHT, _CAMERA_TARGET = 0.8, 0.7, 0.1  # of the reach, from the middle of the area
+_WRIST_BEHIND, _WRIST_ASIDE = 0.1, 0.08  # [m], from the tip, of an arm of that reach
 _INCLINED = 0.1  # [rad]
 _STEPS = {"pick": 6_000_000, "place": 8_000_000, "push": 3_000_000}
 
@@ -316,7 +318,29 @@ def _describe(hand: _Hand) -> dict[str, str]:
         "sag": write_number(0.05 * table.reach, ".2g"),
         "least_down": write_number(-math.cos(table.tilt + 0.35), ".2g"),
         **_describe_held(hand),
+        **_describe_cameras(hand),
     }
+
+
+def _describe_cameras(hand: _Hand) -> dict[str, str]:
+    """Return where cameras are: before the table, looking back at the arm, and on the palm, looking at the tip."""
+    table, gripper = hand.table, hand.gripper
+    middle = (table.low + table.high) / 2 + hand.position[:2]
+    eye = middle + _CAMERA_AWAY * table.reach * table.outwards
+    aside = np.cross(gripper.frame[:, 2], gripper.frame[:, 0])
+    wrist = gripper.point - _WRIST_BEHIND * hand.scale * gripper.frame[:, 2] + _WRIST_ASIDE * hand.scale * aside
+    return {
+        "camera_eye": _write_point([*eye, _CAMERA_HEIGHT * table.reach]),
+        "camera_target": _write_point([*middle, _CAMERA_TARGET * table.reach]),
+        "wrist_eye": _write_point(wrist),
+        "wrist_up": _write_point(-aside),
+        "tip_tuple": _write_point(gripper.point),
+    }
+
+
+def _write_point(values: Sequence[float] | Array) -> SourceText:
+    numbers = np.round(values, 3) + 0.0
+    return SourceText(f"({join_source(write_number(value, 'g') for value in numbers)})")
 
 
 def _describe_held(hand: _Hand) -> dict[str, str]:

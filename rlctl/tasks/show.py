@@ -28,6 +28,9 @@ def show(description: Description, json: str | None) -> None:
     definition = content["definition"]
     parts = _list_quantities(content["observations"])
     _print_section(f"observation  {_shorten(content['observation_space'])}", parts)
+    if definition is not None and definition["cameras"]:
+        rows = [_format_camera(name, camera) for name, camera in definition["cameras"].items()]
+        _print_section("cameras  --observe NAME,... of rlctl distill", rows)
     meaning = definition["action_meaning"] if definition else ""
     actions = [(meaning,)] if meaning else _list_quantities(content["actions"])
     _print_section(f"action  {_shorten(content['action_space'])}", actions)
@@ -88,6 +91,14 @@ def _list_facts(content: Json) -> list[Row]:
         facts["episode"] = f"{definition['episode_s']:.6g} s, {steps:,} steps"
         facts["success"] = "is_success, at the end of an episode" if definition["has_success"] else "not defined"
     return [(name, fact) for name, fact in facts.items() if fact]
+
+
+def _format_camera(name: str, camera: Json) -> Row:
+    width, height = camera["size"]
+    place = "stands still" if camera["body"] is None else f"on {camera['body']}"
+    if camera["link"] is not None:
+        place = f"{place}, {camera['link']}"
+    return name, f"{width} x {height} pixels", place
 
 
 def _shorten(space: str) -> str:

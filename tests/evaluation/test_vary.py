@@ -376,3 +376,12 @@ def test_a_function_of_the_user_has_maps_too(tmp_path, monkeypatch, rlctl):
     assert words[:5] == ["rlctl", "eval", f"{ENVS}:Block", "--policy", f"{tmp_path / 'own.py'}:act"]
     again = rlctl(*words[1:])
     assert "0.0%" in again.stdout
+
+
+def test_looks_are_varied_for_policies_that_see():
+    seen = {axis.name for (axis,) in read_axes(["all"], EnvSpec("pick", observe=("camera", "joint_positions")))}
+    blind = {axis.name for (axis,) in read_axes(["all"], EnvSpec("pick"))}
+    assert seen - blind == {
+        "block_color", "arm_color", "table_color", "light", "camera_pose", "wrist_camera_pose", "distractors",
+    }  # fmt: skip
+    assert "mass" in blind

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rlctl.task import BatchTask, Box, Event, Sim, WorldRngs, events, rewards
+from rlctl.task import BatchTask, Box, Camera, Event, Sim, WorldRngs, events, rewards
 
 MODEL = Path(__file__).with_name("stool.urdf")
 HIPS = ("front_hip", "back_hip")
@@ -105,3 +105,21 @@ class Stool(BatchTask):
 
     def is_success(self) -> np.ndarray:
         return np.abs(self.body.base_position[:, 2] - self.goal) < 0.05
+
+
+class SeenStool(Stool):
+    """The stool before a camera that stands still, and with one on its seat."""
+
+    cameras = {
+        "front": Camera(eye=(1.0, 0.0, 0.3), target=(0.0, 0.0, 0.3), size=(40, 36)),
+        "seat": Camera(eye=(0.0, 0.0, 0.1), target=(0.5, 0.0, 0.0), body="stool", size=(16, 16)),
+    }
+    events = {
+        **Stool.events,
+        "light": Event("reset", events.set_light, brightness=(0.5, 1.5), azimuth=(-180, 180), elevation=(20, 90)),
+        "color": Event("reset", events.set_color, body="stool", red=(0, 1), green=(0, 1), blue=(0, 1)),
+        "pose": Event("reset", events.move_camera, camera="front", shift=(-0.05, 0.05), turn=(-3, 3)),
+        "things": Event(
+            "reset", events.set_distractors, count=(1, 3), center=(0, 0, 0), distance=(0.2, 0.4), size=(0.02, 0.05)
+        ),
+    }

@@ -1,6 +1,7 @@
 """`rlctl tasks new --pick`: the gripper is found by moving its joints, and a block where the arm gets to it."""
 
 import contextlib
+import ctypes.util
 import runpy
 from pathlib import Path
 from types import SimpleNamespace
@@ -246,6 +247,20 @@ def test_it_waits_above_the_table_with_an_open_gripper(plugin):
         low, high = np.array(read_task(plugin).area_low), np.array(read_task(plugin).area_high)
         assert task.find_tip()[0, :2] == pytest.approx((low + high) / 2, abs=0.03)
         assert task.find_tip()[0, 2] > 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="needs libEGL")
+def test_its_cameras_see_the_block(plugin):
+    spec = EnvSpec(plugin.target, sim=MUJOCO, observe=("camera", "wrist_camera", "tip", "tip_to_goal"))
+    with contextlib.closing(spec.make_worlds(2)) as worlds:
+        before = worlds.reset(np.arange(2), [0, 1])
+        middle = (np.array(read_task(plugin).area_low) + read_task(plugin).area_high) / 2
+        worlds.task.block.set_base(np.tile([*middle, 5.0], (2, 1)), (0, 0, 0, 1), worlds=np.arange(2))
+        after = worlds.step(np.zeros((2, 6), np.float32)).observation
+        for camera in ("camera", "wrist_camera"):
+            changed = (np.abs(before[camera].astype(int) - after[camera]) > 30).any(axis=-1)
+            assert (changed.reshape(2, -1).sum(axis=1) >= 4).all()  # [pixels], where the block was
 
 
 @pytest.mark.slow

@@ -1,11 +1,13 @@
 """`rlctl distill`: what the student learns, from whom, and that a killed distillation goes on exactly."""
 
+import ctypes.util
 import functools
 from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
+from gymnasium import spaces
 
 from rlctl.engine import MUJOCO
 from rlctl.environments.info import describe
@@ -27,6 +29,7 @@ from tests.training.comparing import Killed, assert_same_run, rows
 from tests.training.conftest import ENVS
 
 STOOL = "tests.task.batches:Stool"
+needs_egl = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="needs libEGL")
 SHORT = {
     "n_envs": 4,
     "total_timesteps": 256,
@@ -66,6 +69,15 @@ def stool(tmp_path):
 
 
 @pytest.fixture
+def seen_stool(tmp_path):
+    """A policy of the stool that stands before cameras, whose looks events change."""
+    pytest.importorskip("mujoco")
+    looks = {name: {} for name in ("light", "color", "pose", "things")}
+    spec = EnvSpec("tests.task.batches:SeenStool", events=looks, observe=("height", "hips", "goal")).resolve()
+    return write_teacher(tmp_path, spec, [[2.0, -1.0, 0.0, 1.0], [-2.0, 0.0, 0.5, -1.0]])
+
+
+@pytest.fixture
 def run(tmp_path, monkeypatch):
     """Distill into a temporary folder."""
     monkeypatch.setattr(distilling, "EPISODES", 4)
@@ -81,7 +93,7 @@ def run(tmp_path, monkeypatch):
 
 
 def test_the_oldest_steps_are_replaced(monkeypatch):
-    monkeypatch.setattr(labelled_steps, "_MOST_BYTES", 50)  # two additions of 24 bytes
+    monkeypatch.setattr(labelled_steps, "MOST_BYTES", 50)  # two additions of 24 bytes
     steps = LabelledSteps()
     for number in range(4):
         steps.add({"label": np.full((3, 2), number, np.float32)})
@@ -132,7 +144,41 @@ def test_what_is_written_is_of_the_student(run, stool, tmp_path):
     assert observed.type.tensor_type.shape.dim[-1].dim_value == 8
 
 
+@pytest.mark.slow
+@needs_egl
+def test_a_student_sees_by_a_camera(run, seen_stool, tmp_path):
+    result = run(seen_stool, {}, observe="front,hips")
+    file = result.training.run.best_policy
+    info = PolicyFile.read_info(file)
+    assert info.env.spaces()[0]["front"] == spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    assert info.normalized_keys == ["hips"]
+    report = export_policy(ExportRequest(str(file), output=tmp_path / "policy.onnx"))
+    assert report is not None
+    names = {port.name for port in onnx.load(str(tmp_path / "policy.onnx")).graph.input}
+    assert names == {"front", "hips"}
+
+
+def test_a_student_by_camera_takes_few_steps_and_learns_often():
+    teacher = EnvSpec("tests.task.batches:SeenStool", sim=MUJOCO)
+    settings = make_settings(DistillRequest(observe="front,hips", settings={"n_envs": 8}), teacher)
+    assert (settings["n_envs"], settings["total_timesteps"]) == (8, 80_000)
+    assert settings["algo_kwargs"]["n_epochs"] == 16
+    assert "n_envs" not in make_settings(DistillRequest(observe="hips"), teacher)
+
+
+def test_pictures_are_kept_as_bytes(monkeypatch):
+    monkeypatch.setattr(labelled_steps, "MOST_BYTES", 0)
+    monkeypatch.setattr(labelled_steps, "MOST_BYTES_OF_PICTURES", 200)  # four additions of 48 bytes
+    steps = LabelledSteps()
+    for number in range(5):
+        steps.add({"observation/camera": np.full((1, 4, 4, 3), number, np.uint8)})
+    kept = steps.take()["labelled/rows/observation/camera"]
+    assert kept.dtype == np.uint8
+    assert kept[:, 0, 0, 0].tolist() == [4, 1, 2, 3]
+
+
 CASES = {
+    "camera": ("seen_stool", {}, {"observe": "front,hips"}),
     "stool": ("stool", {"observation_history": {"hips": 2}}, {"observe": "hips,speeds"}),
     "recurrent": (
         "stool",

@@ -5,15 +5,29 @@ Each draws values from its ranges and returns them. Changes of a body start from
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 
 from rlctl.errors import TaskError
-from rlctl.task.events.event import Drawn, Fraction, NotNegative, Parts, Positive, Range, Signal, Steps, acts_at
+from rlctl.task.camera import SHAPES, Distractor, Shape
+from rlctl.task.events.event import (
+    Drawn,
+    Fraction,
+    NotNegative,
+    Parts,
+    Positive,
+    Range,
+    RangeLimits,
+    Signal,
+    Steps,
+    acts_at,
+)
 from rlctl.task.events.world_signals import WORLD_SIGNALS, WorldDelay, WorldNoise, in_one_world
 from rlctl.task.sim import Sim
 
 Rng = np.random.Generator
+Elevation = Annotated[Range, RangeLimits(0.0, 90.0)]  # [degrees]
 
 
 @acts_at("reset", "start", "interval", factor=1.0)
@@ -91,6 +105,61 @@ def set_color(
     drawn = [float(rng.uniform(*channel)) for channel in (red, green, blue)]
     sim.body(body).set_color(drawn, links)
     return dict(zip(("red", "green", "blue"), drawn, strict=True))
+
+
+@acts_at("reset", "start", "interval")
+def set_light(sim: Sim, rng: Rng, *, brightness: Positive, azimuth: Range, elevation: Elevation) -> Drawn:
+    """Light the pictures of cameras from elsewhere, `brightness` times as bright as usual.
+
+    The light is at `azimuth` [degrees], counterclockwise from the x axis, and `elevation` [degrees] above the ground.
+    """
+    drawn = {
+        "brightness": float(rng.uniform(*brightness)),
+        "azimuth": float(rng.uniform(*azimuth)),
+        "elevation": float(rng.uniform(*elevation)),
+    }
+    height = math.sin(math.radians(drawn["elevation"]))
+    x, y, _ = _horizontal(math.cos(math.radians(drawn["elevation"])), math.radians(drawn["azimuth"]))
+    sim.set_light(drawn["brightness"], (-x, -y, -height))
+    return drawn
+
+
+@acts_at("reset", "start", "interval", shift=0.0, turn=0.0)
+def move_camera(sim: Sim, rng: Rng, *, camera: str, shift: Range, turn: Range = (0.0, 0.0)) -> Drawn:
+    """Move a camera from where the task has it: by `shift` [m] along each axis of its picture, by `turn` [degrees]
+    about each. A camera that somebody has mounted by hand is a little elsewhere."""
+    by_shift, by_turn = rng.uniform(*shift, 3), rng.uniform(*turn, 3)
+    sim.move_camera(camera, by_shift.tolist(), np.radians(by_turn).tolist())
+    axes = ("right", "up", "forward")
+    drawn = {f"shift {axis}": float(value) for axis, value in zip(axes, by_shift, strict=True)}
+    return drawn | {f"turn {axis}": float(value) for axis, value in zip(axes, by_turn, strict=True)}
+
+
+@acts_at("reset", "start", "interval")
+def set_distractors(
+    sim: Sim, rng: Rng, *, count: Steps, center: Sequence[float], distance: NotNegative, size: Positive
+) -> Drawn:
+    """Show boxes, balls and cylinders in the pictures of cameras, in random colours; nothing touches them.
+
+    They stand at the height of `center` [m], around it at a horizontal `distance` [m]; `size` [m] is half of each side.
+    """
+    drawn = int(rng.integers(int(count[0]), int(count[1]) + 1))
+    shown = []
+    for _ in range(drawn):
+        x, y, _ = _horizontal(float(rng.uniform(*distance)), float(rng.uniform(-math.pi, math.pi)))
+        shape: Shape = SHAPES[int(rng.integers(len(SHAPES)))]
+        sides = rng.uniform(*size, 3)
+        if shape != "box":
+            sides[1:] = sides[0]
+        place = (center[0] + x, center[1] + y, center[2] + float(sides[2]))
+        yaw = float(rng.uniform(-math.pi, math.pi))
+        shown.append(Distractor(shape, place, sides.tolist(), yaw, rng.uniform(0.0, 1.0, 3).tolist()))
+    sim.set_distractors(shown)
+    return {"count": float(drawn)}
+
+
+OF_APPEARANCE = frozenset({set_color, set_light, move_camera, set_distractors})
+"""Functions that change only what cameras see."""
 
 
 @acts_at("start", position=0.0, velocity=0.0)

@@ -29,8 +29,8 @@ class Signals:
         action_space: spaces.Space[Any],
         bounds: Mapping[str, tuple[float, float]],
     ) -> None:
-        pictures = {name: (0, 255) for name, value in first.items() if np.asarray(value).dtype == np.uint8}
-        self.bounds = {**pictures, **bounds}
+        self._pictures = {name for name, value in first.items() if np.asarray(value).dtype == np.uint8}
+        self.bounds = {**dict.fromkeys(self._pictures, (0.0, 255.0)), **bounds}
         self._space = action_space
         self._zero: Array = np.zeros(0)  # the action before the first one
         self.on_observation: list[_SignalEvent] = []
@@ -86,6 +86,8 @@ class Signals:
             for name, noisy in changed.items():
                 if name in self.bounds:
                     noisy = np.clip(noisy, *self.bounds[name])
+                if name in self._pictures:
+                    noisy = np.rint(noisy).astype(np.uint8)
                 parts[name] = noisy.reshape(np.shape(parts[name]))
         return parts
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from rlctl.task.mujoco.scene import MujocoScene
-from rlctl.task.mujoco.world import Array
+from rlctl.task.mujoco.world import MujocoWorld
 
 
 class DrawnWorld:
@@ -19,10 +17,14 @@ class DrawnWorld:
         self.data = scene.mujoco.MjData(self.model)
         self._colors = self.model.geom_rgba.copy()
 
-    def follow(self, model: Any, data: Any, colors: Array) -> None:
-        """Take the state of the other world; `colors` are those of its bodies, shape (bodies, 3), NaN: unchanged."""
-        mine = self.model
-        mine.body_pos[:], mine.body_quat[:], self.data.qpos[:] = model.body_pos, model.body_quat, data.qpos
-        changed = colors[mine.geom_bodyid]
+    def follow(self, world: MujocoWorld, row: int) -> None:
+        """Take the state of another world, of a batch that of one row, and the colours of its bodies."""
+        mine, data = self.model, self.data
+        mine.body_pos[:], mine.body_quat[:] = world.model_row("body_pos", row), world.model_row("body_quat", row)
+        data.qpos[:] = world.data_row("qpos", row)
+        changed = world.model_row("color", row)[mine.geom_bodyid]  # NaN: unchanged
         mine.geom_rgba[:, :3] = np.where(np.isnan(changed), self._colors[:, :3], changed)
-        self._mujoco.mj_fwdPosition(mine, self.data)
+        for compute in (self._mujoco.mj_kinematics, self._mujoco.mj_comPos, self._mujoco.mj_camlight):
+            compute(mine, data)
+        if mine.ntendon:
+            self._mujoco.mj_tendon(mine, data)

@@ -1,11 +1,16 @@
 """Chooses how MuJoCo draws where there is no display."""
 
+import contextlib
 import ctypes
 import importlib
 import os
 import sys
+from collections.abc import Iterator
 from typing import Any
 
+from rlctl.errors import UsageError, describe_exception
+
+_HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
 _EGL = "libEGL.so.1"
 
 
@@ -32,6 +37,15 @@ def draw_without_display(*, only_where_possible: bool = False) -> None:
         for module in (mujoco, sys.modules.get("mujoco.gl_context")):  # which have the name too
             if hasattr(module, "GLContext"):
                 module.GLContext = chosen.GLContext  # type: ignore[union-attr]
+
+
+@contextlib.contextmanager
+def explain_failure() -> Iterator[None]:
+    """Raise `UsageError` for what OpenGL raises in the block of a `with`: exceptions of many kinds."""
+    try:
+        yield
+    except Exception as error:
+        raise UsageError(f"MuJoCo cannot draw: {describe_exception(error)}\n{_HINT}") from None
 
 
 def _has_egl() -> bool:

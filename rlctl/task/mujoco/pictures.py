@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import UsageError, describe_exception
-from rlctl.task.mujoco.opengl import draw_without_display
+from rlctl.task.mujoco.opengl import draw_without_display, explain_failure
 from rlctl.task.mujoco.world import import_mujoco
 
 _NEAREST = 0.05  # of the distance from the eye to the target
@@ -18,7 +17,6 @@ _QUALITY = {"shadowsize": 2048}
 _FINE = {"shadowsize": 4096, "numslices": 40, "numstacks": 24}  # corners of MuJoCo's round shapes would be seen
 _FLOOR_SIDE, _FLOOR_DEPTH = 40.0, 0.02  # [m], where a world has no ground
 _OF_CAMERA = 0.5  # how much of the light from the camera is left
-_HINT = "without a display set MUJOCO_GL=egl (Debian: libegl1) or MUJOCO_GL=osmesa"
 
 
 @dataclass
@@ -66,7 +64,7 @@ def draw(
         max(wanted, present)
         for wanted, present in zip(size, (model.vis.global_.offwidth, model.vis.global_.offheight), strict=True)
     )
-    try:
+    with explain_failure():
         renderer = _find_renderer(model, size)
         renderer.update_scene(data, camera)
         if sun:
@@ -76,8 +74,6 @@ def draw(
         for marker in markers:
             _add_marker(renderer.scene, marker)
         picture: NDArray[np.uint8] = renderer.render()
-    except Exception as error:  # OpenGL raises many kinds
-        raise UsageError(f"MuJoCo cannot draw: {describe_exception(error)}\n{_HINT}") from None
     return picture
 
 

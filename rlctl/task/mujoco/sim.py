@@ -15,8 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.errors import TaskError
 from rlctl.task.attachments import Attachment, Joined
+from rlctl.task.camera import Distractor, Pictures
 from rlctl.task.mujoco.body import MujocoBody
+from rlctl.task.mujoco.cameras import MOST_DISTRACTORS, CameraPictures, as_row, make_looks
 from rlctl.task.mujoco.drawn_world import DrawnWorld
 from rlctl.task.mujoco.ideal_motors import make_ideal_motors
 from rlctl.task.mujoco.parts import WORLD, Parts
@@ -53,7 +56,9 @@ class MujocoSim(Sim):
         self._control_dt, self._solref, self._iterations = control_dt, solref, iterations
         self._visuals = visuals and worlds in (None, 1)  # nobody sees one world of many
         self.fields = Fields(self.world)
+        self.cameras = {}
         self._views: dict[int, OneWorldSim] = {}
+        self._camera_pictures: list[CameraPictures] = []  # one, after the first picture of a camera
         self.clear()
 
     def clear(self) -> None:
@@ -62,6 +67,7 @@ class MujocoSim(Sim):
         self._markers: list[Marker] = []
         self._added: list[Callable[[MujocoScene], Parts]] = []  # what has added each body
         self._drawn: list[DrawnWorld] = []  # one, after the first picture of a world without visual shapes
+        self._close_cameras()
         self._scene = self._make_scene(visuals=self._visuals)
         model = self._scene.spec.compile()
         self.world.extra.clear()
@@ -192,6 +198,7 @@ class MujocoSim(Sim):
                     roll[number] = parts.file.roll.get(link, 0.0)
         self.world.extra |= {"friction": friction, "spin": spin, "roll": roll}
         self.world.extra["ideal motors"] = make_ideal_motors(model.nu)
+        self.world.extra = make_looks(self.cameras) | self.world.extra  # what `build` has set so far stays
         strength = np.ones(model.nu)
         color = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
         if "color" in self.world.extra:  # what a task has changed in `build` so far
@@ -319,14 +326,48 @@ class MujocoSim(Sim):
         if self._visuals:
             return self.model, self.data
         if not self._drawn:
-            scene = self._make_scene(visuals=True)
-            for add in self._added:
-                add(scene)
-            self._drawn.append(DrawnWorld(scene))
-        self._drawn[0].follow(self.model, self.data, self.fields.model("color"))
+            self._drawn.append(DrawnWorld(self._make_drawn_scene()))
+        self._drawn[0].follow(self.world, 0)
         return self._drawn[0].model, self._drawn[0].data
 
+    def _make_drawn_scene(self) -> MujocoScene:
+        scene = self._make_scene(visuals=True)
+        for add in self._added:
+            add(scene)
+        return scene
+
+    def take_pictures(self, camera: str, worlds: Rows = None) -> Pictures:
+        self.find_camera(camera)
+        if not self._camera_pictures:
+            self._camera_pictures.append(CameraPictures(self._make_drawn_scene(), self.cameras))
+        rows = worlds
+        if rows is None:
+            own = self.fields.index
+            rows = np.arange(self.world.count or 1) if own is None else np.array([own])
+        return self._camera_pictures[0].take(camera, self.world, rows)
+
+    def set_light(self, brightness: float, direction: Sequence[float]) -> None:
+        self.fields.model("light")[..., :] = [brightness, *direction]
+
+    def move_camera(self, camera: str, shift: Sequence[float], turn: Sequence[float]) -> None:
+        self.find_camera(camera)
+        self.fields.model("camera_pose")[..., list(self.cameras).index(camera), :] = [*shift, *turn]
+
+    def set_distractors(self, distractors: Sequence[Distractor]) -> None:
+        if len(distractors) > MOST_DISTRACTORS:
+            raise TaskError(f"set_distractors: {len(distractors)} things; at most {MOST_DISTRACTORS} fit")
+        rows = self.fields.model("distractors")
+        rows[...] = np.nan
+        for number, distractor in enumerate(distractors):
+            rows[..., number, :] = as_row(distractor)
+
+    def _close_cameras(self) -> None:
+        for pictures in self._camera_pictures:
+            pictures.close()
+        self._camera_pictures.clear()
+
     def close(self) -> None:
+        self._close_cameras()
         with contextlib.suppress(AttributeError):
             self.world.batch = None
 

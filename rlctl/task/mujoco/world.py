@@ -121,6 +121,19 @@ class MujocoWorld:
         array: Array = getattr(owner, name.removeprefix("opt."))
         return array
 
+    def model_row(self, name: str, row: int) -> Array:
+        """Return an array of `model` of one world, for reading only: one that all worlds share stays shared."""
+        if self.batch is None:
+            return self._find(name)
+        rows = self._rows.get(name) if name in self.extra else self.batch.expanded(name)
+        array: Array = self._find(name) if rows is None else rows[row]
+        return array
+
+    def data_row(self, name: str, row: int) -> Array:
+        """Return an array of the state of one world, for reading only."""
+        array: Array = getattr(self.mj_data, name) if self.batch is None else self.batch.bind(name)[row]
+        return array
+
     def built(self, name: str) -> Array:
         """Return the values of the built world of an array of `model`, without a leading axis."""
         return self._built[name] if name in self._built else self._find(name)

@@ -45,7 +45,7 @@ class PybulletSim(Constraints):
         self.client: int = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
         if self.client < 0:
             raise TaskError("PyBullet could not open a window; leave out --gui on a machine without a display")
-        self.bodies = {}
+        self.bodies, self.cameras = {}, {}
         self._times = control_dt, substeps
         self._settings = {
             "fixedTimeStep": control_dt,

@@ -132,6 +132,12 @@ class DistillingRollouts(OnPolicyRollouts):
             both, starts = states
             distribution, _ = policy.get_distribution(observed, both.pi, starts)
             values = policy.predict_values(observed, both.vf, starts)
+        elif policy.share_features_extractor:
+            features = policy.extract_features(observed)  # once: of pictures it takes most of the time
+            latent = policy.mlp_extractor.forward_actor(features)
+            distribution = policy._get_action_dist_from_latent(latent)
+            # The critic does not change the features that the actor needs.
+            values = policy.value_net(policy.mlp_extractor.forward_critic(features.detach()))
         else:
             distribution, values = policy.get_distribution(observed), policy.predict_values(observed)
         if isinstance(self.model.action_space, spaces.Box):
