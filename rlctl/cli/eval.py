@@ -134,7 +134,7 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
         "Options": ["baseline", "checkpoint", "pretrained", "task", "verify"],
         "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
         "Where": ["gui", "sim"],
-        "Output": ["output", "video", "size", "camera", "json"],
+        "Output": ["output", "video", "seconds", "size", "camera", "json"],
     }
 )
 def replay(request: ReplayRequest, pretrained: Pretrained = False, json: Json = None) -> None:
