@@ -5,7 +5,7 @@ import numpy as np
 import pybullet as p
 from broken_meaning import Robot
 from broken_reach import Arm as Reach
-from broken_reach_bullet import RL619Reacher
+from broken_reach_bullet import Reacher
 from mujoco_robots import MujocoArm
 from robots import Pusher
 
@@ -71,7 +71,7 @@ class RL626ReachElbow(Reach):
         return float(np.linalg.norm(self.goal - self.data.xpos[3]))
 
 
-class RL626ReacherElbow(RL619Reacher):
+class RL626ReacherElbow(Reacher):
     """Observes where its tip is, and is judged by its second link."""
 
     def to_judged(self):

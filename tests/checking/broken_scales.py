@@ -3,7 +3,7 @@
 import numpy as np
 from broken_meaning import Drone, Rover
 from broken_reach import Arm as Reach
-from broken_reach_bullet import RL619Reacher
+from broken_reach_bullet import Reacher
 from mujoco_robots import MujocoArm, MujocoHopper
 from robots import Arm, Crawler, Pusher
 
@@ -44,7 +44,7 @@ class RL706PusherOnePercent(Pusher):
         return super().target(0.01 * action)
 
 
-class RL625RL706ReacherOnePercent(RL619Reacher):
+class RL625RL706ReacherOnePercent(Reacher):
     def target(self, action):
         return super().target(0.01 * action)
 
@@ -69,7 +69,7 @@ class RL624DroneTolerance(Drone):
     near = 0.0015
 
 
-class RL624ReacherTolerance(RL619Reacher):
+class RL624ReacherTolerance(Reacher):
     def is_success(self):
         return bool(np.linalg.norm(self.to_goal()) < 0.002)
 
@@ -113,7 +113,7 @@ class RL119HopperCentimetres(MujocoHopper):
         return observation
 
 
-class RL119ReacherCentimetres(RL619Reacher):
+class RL119ReacherCentimetres(Reacher):
     def observe(self):
         observation = super().observe()
         observation[6:] *= 100

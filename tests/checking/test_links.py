@@ -15,7 +15,7 @@ CASES = [
     broken("RL626GantryBridge", "broken_links.py:Gantry"),
     broken("RL626ArmElbow", "mujoco_robots.py:MujocoArm"),
     broken("RL626ReachElbow", "broken_reach.py:Arm"),
-    broken("RL626ReacherElbow", "broken_reach_bullet.py:RL619Reacher", pybullet=True),
+    broken("RL626ReacherElbow", "broken_reach_bullet.py:Reacher", pybullet=True),
     broken("RL626CrankOtherLink", "broken_links.py:CrankPoints", pybullet=True),
 ]
 

@@ -12,7 +12,7 @@ def broken(name, twin, *rules, **settings):
     return case(f"broken_scales.py:{name}", *expected, twin=twin, **settings)
 
 
-REACHER = "broken_reach_bullet.py:RL619Reacher"
+REACHER = "broken_reach_bullet.py:Reacher"
 CASES = [
     broken("RL625RoverOnePercent", "broken_meaning.py:Rover", "RL625"),
     broken("RL625ReachOnePercent", "broken_reach.py:Arm", "RL625"),
