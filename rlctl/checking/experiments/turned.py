@@ -83,9 +83,11 @@ def _can_turn(env: Any) -> bool:
 
 def _is_level(model: Any, data: Any) -> bool:
     """Say whether all of the world is level planes, and one robot is free."""
-    static = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_contype | model.geom_conaffinity).astype(bool))
+    is_static = model.body_weldid == 0
+    touches = (model.geom_contype | model.geom_conaffinity).astype(bool)
+    static = np.flatnonzero(is_static[model.geom_bodyid] & touches)
     is_plane = all(model.geom_type[geom] == PLANE and data.geom_xmat[geom][8] > 1 - 1e-9 for geom in static)
-    roots = {int(root) for root in model.body_rootid[1:]}
+    roots = {int(root) for root in model.body_rootid[~is_static]}
     return is_plane and len(roots) == 1 and int((model.jnt_type == FREE).sum()) == 1
 
 
