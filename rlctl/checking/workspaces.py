@@ -103,7 +103,8 @@ def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> 
         return np.vstack([copy.xpos[bodies], copy.site_xpos[sites]])
 
     limits = [tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else (-np.pi, np.pi) for j in joints]
-    names = [model.body(i).name for i in bodies] + [model.site(i).name for i in sites]
+    bodies_named = [model.body(i).name or f"body {i}" for i in bodies]
+    names = bodies_named + [model.site(i).name or f"site {i}" for i in sites]
     return Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
 
 

@@ -152,7 +152,7 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
         "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
         "A policy of another project": ["deploy", "model", "terrain"],
         "Where": ["gui", "sim"],
-        "Output": ["output", "video", "size", "camera", "json"],
+        "Output": ["output", "video", "seconds", "size", "camera", "json"],
     }
 )
 def replay(

@@ -94,9 +94,6 @@ class ContactQuery:
     links: tuple[int | None, int | None]
     calls: int = 0
     contacts: int = 0
-    others: int = 0  # calls that returned contacts of two bodies
-    own: int = 0  # calls that returned only contacts of a body with itself
-    met: tuple[int, int] = (-1, -1)  # two links of one body in such a contact
 
 
 class BulletCalls:
@@ -113,7 +110,6 @@ class BulletCalls:
         self.models: dict[tuple[int, int], str] = {}  # the file of a URDF, by client and body
         self.search_paths: list[str] = []
         self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
-        self.hides_own = False  # whether getContactPoints leaves contacts of a body with itself out
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -150,11 +146,6 @@ class BulletCalls:
             bodies = tuple(-1 if body is None else int(body) for body in (one, two))
             query = self.queries.setdefault(key, ContactQuery(call, client, bodies, (link, other)))  # type: ignore[arg-type]
             query.calls, query.contacts = query.calls + 1, query.contacts + len(result or ())
-            if any(contact[1] != contact[2] for contact in result or ()):
-                query.others += 1
-            elif result:
-                query.own += 1
-                query.met = result[0][3], result[0][4]
             return
         given = _read_motors(name, arguments, keywords)
         if name != "resetJointState":
@@ -266,8 +257,6 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
             if name == "stepSimulation" and calls.before_step is not None:
                 calls.before_step(int(keywords.get("physicsClientId", arguments[0] if arguments else 0)))
             result = function(*arguments, **keywords)
-            if calls.hides_own and name == "getContactPoints":
-                return tuple(contact for contact in result or () if contact[1] != contact[2])
             if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.replaying.camera import FIELD_OF_VIEW
 from rlctl.task.body import Body
+from rlctl.task.commands import name_for_people
 from rlctl.task.env import TaskEnv
 from rlctl.task.rotations import look_along, roll_pitch_yaw
 
@@ -90,7 +91,7 @@ class Caption:
         for name, command in self._env.commands().items():
             if name.rpartition("_")[0] in shown:  # a coordinate of a marker, which is drawn
                 continue
-            line = f"{name} commanded {float(command.value):+.2f}"
+            line = f"{name_for_people(name)}: commanded {float(command.value):+.2f}"
             if name in measured:
                 line += f", measured {measured[name]:+.2f}"
             lines.append(f"{line} {command.unit}".rstrip())

@@ -7,6 +7,7 @@ where it has none, its PyBullet world by that renderer.
 import contextlib
 import dataclasses
 import fractions
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -125,6 +126,7 @@ def film_episodes(
     size: tuple[int, int] | None = None,
     draw: Warn | None = None,
     at_s: float | None = None,
+    longest_s: float | None = None,
 ) -> tuple[list[Kept], FilmReport]:
     """Play an episode per seed and write one film of all of them, atomically; `watch` is called after every step.
 
@@ -134,7 +136,8 @@ def film_episodes(
     no pictures, or none of that size.
 
     A `.png` is one picture of the only episode, `at_s` [s] after its start, by default in its middle. Raises
-    `UsageError` for a time that the episode does not reach.
+    `UsageError` for a time that the episode does not reach. With `longest_s` [s] a film has only the beginning of each
+    episode, which is played to its end.
     """
     still = None
     if path.suffix == ".png":
@@ -145,7 +148,7 @@ def film_episodes(
     reports: list[FilmReport] = []
 
     def write(part: Path) -> None:
-        film = _Film(env, part, viewpoint, size, still)
+        film = _Film(env, part, viewpoint, size, still, longest_s)
         both = join_watches(watch, film.watch)
         for number, seed in enumerate(seeds):
             kept.append(keep(number, play_episode(env, spec, seed, begin(seed), policy=policy, watch=both, draw=draw)))
@@ -176,8 +179,9 @@ class _Film:
         viewpoint: Viewpoint | None,
         size: tuple[int, int] | None = None,
         still: int | None = None,
+        longest_s: float | None = None,
     ) -> None:
-        """With `still` only this step is drawn."""
+        """With `still` only this step is drawn, with `longest_s` [s] only the beginning of each episode."""
         self._still = still
         self._size = size
         self._view = look_at(env, *(size or _SIZE[path.suffix]), viewpoint)
@@ -186,6 +190,7 @@ class _Film:
         self._step = 0
         self._dt = dt = find_dt(env) or DEFAULT_DT
         self._every = max(1, round(1 / (_RATE[path.suffix] * dt)))
+        self._last_step = math.inf if longest_s is None else round(longest_s / dt)
         self._rate = 1 / (dt * self._every)
         self._count, self._seconds = 0, 0.0
         self._is_taken = False
@@ -193,9 +198,11 @@ class _Film:
 
     def watch(self, step: int) -> None:
         """Take a picture after the reset and after every n-th step."""
-        self._step = step
         if step == 0:
             self._begin()
+        if step > self._last_step:
+            return
+        self._step = step
         self._is_taken = step == self._still if self._still is not None else step % self._every == 0
         if self._is_taken:
             self._take()
@@ -220,10 +227,10 @@ class _Film:
         self.writer.add(self._last)
 
     def pause(self) -> None:
-        """Take the last picture of an episode and show it for a moment."""
+        """Take the last picture of an episode and show it for a moment; where the film ends before, the last taken."""
         if self._still is not None:
             return
-        if not self._is_taken:
+        if not self._is_taken and self._step < self._last_step:
             self._take()
         for _ in range(round(_PAUSE_S * self._rate)):
             self.writer.add(self._last)

@@ -59,6 +59,7 @@ def run_replay(request: ReplayRequest) -> ReplayResult:
                 size=size,
                 draw=draw,
                 at_s=request.at,
+                longest_s=request.seconds,
             )
     elif request.gui and seeds:
         with closing(open_window(spec)) as env:
@@ -93,7 +94,7 @@ def _check_request(request: ReplayRequest) -> None:
     for names in (*outputs, ("worst", "best", "failures")):
         if len(given := [f"--{name}" for name in names if getattr(request, name)]) > 1:
             raise UsageError(f"{given[0]} and {given[1]} exclude each other: leave out {given[1]}")
-    for name in ("camera", "size", "at"):
+    for name in ("camera", "size", "at", "seconds"):
         if getattr(request, name) is not None and request.video is None:
             raise UsageError(f"--{name} is for films: add --video FILE.mp4")
     if request.verify is not None and source is not None:
@@ -123,6 +124,8 @@ def _check_picture(request: ReplayRequest, video: Path) -> None:
     is_picture = video.suffix == ".png"
     if request.at is not None and not is_picture:
         raise UsageError("--at is for one picture: add --video FILE.png")
+    if request.seconds is not None and is_picture:
+        raise UsageError("--seconds is for films: add --video FILE.mp4, or --at SECONDS for a picture")
     if is_picture and (count or 1) > 1:
         raise UsageError(f"--video {video}: a picture is of one episode: leave out --episodes")
 

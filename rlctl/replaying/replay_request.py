@@ -66,6 +66,10 @@ class ReplayRequest:
         float | None,
         Option("Of a .png: seconds after the start.", metavar="SECONDS", min=0, default_text="the middle"),
     ] = None
+    seconds: Annotated[
+        float | None,
+        Option("Film only so much of each episode.", metavar="SECONDS", min=0.1, default_text="all"),
+    ] = None
     size: Annotated[
         str | None,
         Option("Size of the film in pixels.", metavar="WIDTHxHEIGHT", default_text="640x480; of a .gif 400x300"),

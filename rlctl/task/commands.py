@@ -2,6 +2,13 @@
 
 from typing import Any, NamedTuple
 
+_VELOCITIES = {"lin_vel_x": "velocity forwards", "lin_vel_y": "velocity to the left", "ang_vel_z": "turning left"}
+
+
+def name_for_people(name: str) -> str:
+    """Return how films and figures write a commanded quantity: `lin_vel_x` is `velocity forwards`."""
+    return _VELOCITIES.get(name, name.replace("_", " "))
+
 
 class CommandTerm(NamedTuple):
     """A commanded quantity of a task, for `Task.commands`: a velocity to walk with, a coordinate of a goal.

@@ -50,7 +50,7 @@ class FallingHopper(Follower, MujocoHopper):
         self.data.qpos[2] = 0.8
 
     def speed(self):
-        return float(self.data.qvel[0])
+        return self.ahead()
 
     def has_fallen(self):
         return bool(self.data.qpos[2] < 0.6)

@@ -4,7 +4,7 @@ import numpy as np
 from robots import Arm
 
 
-class RL619Reacher(Arm):
+class Reacher(Arm):
     """Its tip is at most 0.82 m from its base."""
 
     farthest = 0.6  # goal, from the base [m]
@@ -36,5 +36,5 @@ class RL619Reacher(Arm):
         return {"is_success": success}
 
 
-class RL619ReacherFarGoals(RL619Reacher):
+class RL619ReacherFarGoals(Reacher):
     farthest = 1.4

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pybullet as p
-from robots import HERE, Arm, Boat, Crawler, Pusher, Tank
+from robots import Arm, Boat, Crawler, Pusher, Tank
 
 
 class RL114BoatHiddenBuoy(Boat):
@@ -404,25 +404,3 @@ class RL821CrawlerDriven(RL821CrawlerHeldByMotors):
     def load(self):
         super().load()
         self.release()
-
-
-class RL822PincerStandsOnItself(Crawler):
-    """Its two front legs can hit each other; a foot that touches anything counts as one on the floor."""
-
-    home = np.array([0.0, 0.0, 0.0])
-
-    def load(self):
-        flags = p.URDF_USE_SELF_COLLISION
-        self.robot = p.loadURDF(str(HERE / "pincer.urdf"), [0, 0, 0.09], flags=flags, physicsClientId=self.client)
-
-    def stands(self, foot):
-        contacts = p.getContactPoints(bodyA=self.robot, linkIndexA=foot, physicsClientId=self.client)
-        return len(contacts) > 0
-
-    def reward(self):
-        return super().reward() + 0.1 * (self.stands(0) + self.stands(1))
-
-
-class RL822PincerStands(RL822PincerStandsOnItself):
-    def stands(self, foot):
-        return self.touches(foot)

@@ -177,7 +177,12 @@ class MujocoHopper(MujocoRobot):
         return np.concatenate([self.data.qpos[2:3], *parts])
 
     def reward(self):
-        return float(self.data.qvel[0]) - 0.1 * abs(self.data.qpos[2] - 0.45)
+        return self.ahead() - 0.1 * abs(self.data.qpos[2] - 0.45)
 
     def succeeds(self):
-        return self.data.qvel[0] > 0.3
+        return self.ahead() > 0.3
+
+    def ahead(self):
+        """How fast it moves in the direction in which it looks [m/s]."""
+        turn = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True)
+        return float(turn.inv().apply(self.data.qvel[:3])[0])

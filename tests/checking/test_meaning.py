@@ -35,7 +35,7 @@ CASES = [
     case(
         "broken_reach_bullet.py:RL619ReacherFarGoals",
         ("RL619", "warning"),
-        twin="broken_reach_bullet.py:RL619Reacher",
+        twin="broken_reach_bullet.py:Reacher",
         pybullet=True,
     ),
     broken("RL121RoverLosesItsGoal", ("RL121", "warning"), twin="RL121RoverSeesBadly"),

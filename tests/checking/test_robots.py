@@ -54,7 +54,6 @@ CASES = [
         *(("RL821", "error"), ("RL701", "info")),  # what its motors do is chance
         twin="broken_robots.py:RL821CrawlerDriven",
     ),
-    broken("RL822PincerStandsOnItself", "RL822", "info", "RL822PincerStands"),
 ]
 
 

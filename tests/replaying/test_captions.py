@@ -9,6 +9,7 @@ from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
 from rlctl.replaying.captions import CameraPose, Caption, annotate
 from rlctl.replaying.views import look_at, make_filmable
+from rlctl.task.commands import name_for_people
 
 
 def test_a_point_in_the_picture_by_hand():
@@ -39,8 +40,13 @@ def test_a_walking_robot_names_commanded_and_measured_velocities():
         time_line, command_line = caption.list_lines(1.5)
         command = float(inner.commands()["lin_vel_x"].value)
     assert time_line == "1.50 s"
-    assert command_line.startswith(f"lin_vel_x commanded {command:+.2f}, measured ")
+    assert command_line.startswith(f"velocity forwards: commanded {command:+.2f}, measured ")
     assert command_line.endswith(" m/s")
+
+
+def test_names_of_commands_are_written_for_people():
+    assert name_for_people("ang_vel_z") == "turning left"
+    assert name_for_people("body_height") == "body height"
 
 
 def test_coordinates_of_a_marker_are_drawn_and_not_written():

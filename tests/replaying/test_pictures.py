@@ -137,6 +137,22 @@ def test_a_filmed_and_recorded_episode_of_a_policy_repeats(tmp_path):
 
 
 @pytest.mark.pybullet
+def test_a_film_of_the_beginning_of_an_episode(tmp_path):
+    request = ReplayRequest("reach", baseline="zero", video=tmp_path / "film.gif", size="64x64", seconds=0.5)
+    result = run_replay(request)
+    # A picture every 0.05 s, that of the reset among them; the episode goes on.
+    assert result.film.pictures == round(0.5 * result.film.rate) + 1
+    assert result.episodes[0].length > 0.5 * result.film.rate
+
+
+def test_the_length_of_a_film_needs_a_film(tmp_path):
+    with pytest.raises(UsageError, match=r"--seconds is for films: add --video FILE.mp4$"):
+        run_replay(ReplayRequest("reach", seconds=1.0))
+    with pytest.raises(UsageError, match=r"--seconds is for films: add --video FILE.mp4, or --at SECONDS"):
+        run_replay(ReplayRequest("reach", seconds=1.0, baseline="zero", video=tmp_path / "one.png"))
+
+
+@pytest.mark.pybullet
 def test_a_rollout_is_forgotten_before_the_next_episode(tmp_path):
     """The scenes of many episodes would fill the memory until the film is done."""
     spec = EnvSpec("reach")

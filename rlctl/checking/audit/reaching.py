@@ -107,6 +107,14 @@ class ObjectMover(Mover):
         return np.full(3, SPEED)
 
 
+class BaseMover(ObjectMover):
+    """The base of a robot that stands on the ground, such as one with wheels, at the height at which it is."""
+
+    def solve(self, target: Array) -> Array | None:
+        """See `Mover`."""
+        return np.array([*target[:2], self.body.base_position[2]])
+
+
 @dataclasses.dataclass(frozen=True)
 class Goal:
     """What has to be where, so that the task calls it a success."""
@@ -138,8 +146,8 @@ def read_targets(world: PlayWorld) -> dict[str, Array]:
         if name != stem and all(f"{stem}_{axis}" in commands for axis in AXES):
             found[stem] = np.array([float(commands[f"{stem}_{axis}"].value) for axis in AXES])
     for name, attribute in read_attributes(world.instance.env).items():
-        if attribute.numbers.size == len(AXES) and GOALS.search(name):
-            found[name] = attribute.numbers
+        if attribute.numbers.size in (2, len(AXES)) and GOALS.search(name):
+            found[name] = np.array([*attribute.numbers, 0.0][:3])  # of two numbers it is a place on the ground
     distinct: dict[str, Array] = {}
     for name, place in found.items():
         is_known = any(np.allclose(place, other) for other in distinct.values())
@@ -149,7 +157,7 @@ def read_targets(world: PlayWorld) -> dict[str, Array]:
 
 
 def list_movers(world: PlayWorld) -> Iterator[Mover]:
-    """Yield what may be brought to a goal: links of arms, the last ones first, and objects."""
+    """Yield what may be brought to a goal: links of arms, the last ones first, objects, and robots with a free base."""
     bodies = [] if world.sim is None else list(world.sim.bodies.values())
     for body in bodies:
         if body.fixed and body.joint_names and body.find_trunk() is None:
@@ -157,6 +165,10 @@ def list_movers(world: PlayWorld) -> Iterator[Mover]:
                 yield LinkMover(body, link)
     for body in bodies:
         if not body.fixed and not body.joint_names:
+            yield ObjectMover(body)
+    for body in bodies:
+        if not body.fixed and body.joint_names:
+            yield BaseMover(body)
             yield ObjectMover(body)
 
 

@@ -26,6 +26,7 @@ class ActionTrials:
     trials: Trials
     dimensions: Sequence[ActionNumber]  # All numbers of the action that can be varied
     earliest: set[int]  # The first steps at which anything of the observation follows the first action
+    rewarded: set[int]  # The first steps at which the reward follows the direction of the first action; 0 for none
 
     @property
     def is_late(self) -> bool:
@@ -48,7 +49,8 @@ def compare_actions(context: Context) -> Iterator[ChildMessage]:
         trials.require_repeatable()
         pairs, opposites = _play_first_actions(trials, dimensions)
         first = [_first_changes(pair) for pair in pairs]
-        shown = ActionTrials(trials, dimensions, {min(steps.values(), default=0) for steps in first})
+        earliest = {min(steps.values(), default=0) for steps in first}
+        shown = ActionTrials(trials, dimensions, earliest, _find_first_rewards(opposites))
         if not shown.is_late:
             yield from _measure_delays(pairs, opposites)
         yield from judges_actions.judge(shown)

@@ -25,7 +25,13 @@ STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
 ROUNDING, PART = 1e-5, 5e-7  # of observations to float32, and of large ones
 COMPARED = 4  # resets after which the places of links are compared with the observation
+SMALLER_UNITS = (100.0, 1000.0)  # times as many of them [cm, mm]
+SCALED_GOAL = "goal in a smaller unit"
 NEAR = 2e-3  # how near they are [m]
+PLACED_EPISODES = 3
+PLACED_STEPS = 3  # after which a goal is put at the place of the robot
+STARTS_COMPARED = 9
+MOST_SOURCES = 24  # places in the observation at which it is put
 Numbers = NDArray[np.float64]
 Source = tuple[int, int]
 """The element of an observation from which on it has a place, and the sign with which the goal is in it, or 0."""
@@ -39,6 +45,16 @@ class DrawnGoal:
     copies: Sequence[Source]  # Where the observation has it, or its difference to something
     goals: Mapping[int, Sequence[float]]  # by seed
     reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
+
+
+@dataclasses.dataclass(frozen=True)
+class ScaledGoal:
+    """A place that each reset draws, and that the observation has in a smaller unit: the fact `SCALED_GOAL`."""
+
+    name: str  # of the attribute
+    element: int  # of the observation, from which on it has the place
+    factor: float
+    size: float  # of what is observed there
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +81,56 @@ class GoalTrials:
     def range(self) -> Numbers:
         """How far the goals lie apart. Shape (size,)."""
         return np.asarray(np.ptp(self.goals, axis=0))
+
+    @functools.cached_property
+    def at_goal(self) -> "AtGoal":
+        """Where the observation has the place at which a goal is a success."""
+        episode = GoalEpisode(self, FIRST_SEED, "repeated", PLACED_STEPS)
+        reports_success = not episode.has_ended and episode.step().succeeds is not None
+        sources = find_sources(self.drawn.copies, episode.observed[None], episode.goal[None])
+        for source in sources[:MOST_SOURCES] if reports_success else ():
+            if self.is_success_at(source):
+                return AtGoal(source, reports_success)
+        return AtGoal(None, reports_success)
+
+    def is_success_at(self, source: Source) -> bool:
+        """Say whether a goal at a place of the observation is a success, in several episodes."""
+        for seed in range(FIRST_SEED, FIRST_SEED + PLACED_EPISODES):
+            place = self.find_place(source, seed)
+            if place is None or not self.succeeds(seed, place):
+                return False
+        return True
+
+    def find_place(self, source: Source, seed: int) -> Numbers | None:
+        """Return what is a place by a source, after a few steps with the action that the seed draws; None if the
+        episode ends or succeeds before."""
+        episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
+        if episode.has_ended or episode.has_succeeded or episode.step(episode.goal).succeeds:
+            return None
+        return episode.read(source)
+
+    def find_links(self, seed: int) -> dict[str, Numbers]:
+        """Return where the links of fixed robots are after the same steps, by name; none if the episode ends before."""
+        episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
+        if episode.has_ended or episode.has_succeeded or episode.step(episode.goal).succeeds:
+            return {}
+        places: dict[str, Numbers] = {}
+        for chain in find_chains(self.instance.env):
+            places |= dict(zip(chain.names, chain.read()[:, : episode.goal.size], strict=True))
+        return places
+
+    def succeeds(self, seed: int, goal: Numbers) -> bool | None:
+        """Say whether the last of these steps is a success with the goal at a place; None if it is not played."""
+        episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
+        return None if episode.has_ended else episode.step(goal).succeeds
+
+
+@dataclasses.dataclass(frozen=True)
+class AtGoal:
+    """What has to be at the goal."""
+
+    source: Source | None  # None if no goal at any place of the observation was a success
+    reports_success: bool
 
 
 class GoalEpisode:
@@ -96,6 +162,10 @@ class GoalEpisode:
         succeeds = _read_success(moment)
         self.has_succeeded |= bool(succeeds)
         return GoalStep(moment.reward_number, succeeds)
+
+    def read(self, source: Source) -> Numbers:
+        """Return the place of the robot by a source. Shape (size,)."""
+        return read_place(source, self.observed[None], self.goal[None])[0]
 
     def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
         """Take a step for each goal; less if the episode ends."""
@@ -136,9 +206,20 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
             yield Fact("goals", drawn)
             yield from judges_goals.judge(GoalTrials(instance, drawn))
             return
+    yield from _find_scaled(instance, names)
     if by_chance:
         raise NotJudged("the seed does not determine what reset draws (RL301)")
     raise NotApplicable("the observation follows no attribute that reset draws")
+
+
+def _find_scaled(instance: Instance, names: Sequence[str]) -> Iterator[Fact]:
+    """Yield the first attribute that the observation shows in a smaller unit."""
+    for name in names:
+        for factor in SMALLER_UNITS:
+            if copies := _find_copies(instance, name, factor):
+                seen = _observe(instance, name, 0.0)[copies[0][0] :][: read_attributes(instance.env)[name].numbers.size]
+                yield Fact(SCALED_GOAL, ScaledGoal(name, copies[0][0], factor, float(np.linalg.norm(seen))))
+                return
 
 
 def _find_drawn(instance: Instance) -> tuple[list[str], list[str]]:
@@ -169,12 +250,12 @@ def _is_place(one: Attribute, two: Attribute) -> bool:
     return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) >= min(2, sizes[0])
 
 
-def _find_copies(instance: Instance, name: str) -> list[tuple[int, int]]:
-    """Return where the observation has the place, or its difference to something, and with which sign."""
+def _find_copies(instance: Instance, name: str, factor: float = 1.0) -> list[tuple[int, int]]:
+    """Return where the observation has the place, or its difference to something, times a factor; and the sign."""
     plain, shifted = (_observe(instance, name, shift) for shift in (0.0, 1.0))
     if plain.shape != shifted.shape:
         return []
-    change, shift = shifted - plain, SHIFT[: read_attributes(instance.env)[name].numbers.size]
+    change, shift = shifted - plain, factor * SHIFT[: read_attributes(instance.env)[name].numbers.size]
     parts = [change[element : element + len(shift)] for element in range(len(change) - len(shift) + 1)]
     rounding = [ROUNDING + PART * np.abs(plain[i : i + len(shift)]).max() for i in range(len(parts))]
     return [
@@ -215,6 +296,12 @@ def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> di
                 # A goal minus itself is the origin, where the base of many robots is.
                 reaches |= {source: reach} if reach.distance > NEAR else {}
     return reaches
+
+
+def measure_distances(trials: GoalTrials, source: Source) -> Numbers:
+    """Return how far the goal is from the robot at the start of some episodes. Shape (STARTS_COMPARED,)."""
+    episodes = [GoalEpisode(trials, FIRST_SEED + number) for number in range(STARTS_COMPARED)]
+    return np.array([np.linalg.norm(episode.read(source) - episode.goal) for episode in episodes])
 
 
 def find_sources(copies: Sequence[Source], rows: Numbers, goals: Numbers) -> list[Source]:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from rlctl.checking import rewards
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.records import Records
+from rlctl.checking.experiments.turned import TurnedRobot, judges_turned
+from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs
 
@@ -19,7 +20,8 @@ RULE = Rule(
     meaning="""
         The reward jumps in the steps in which an observed angle passes from pi to -pi, and hardly ever else.
         The robot itself moves on smoothly there: the reward uses a difference of two angles that is not
-        wrapped, so an error of 0.1 rad counts as one of 6.2, and turning the short way is punished.
+        wrapped, so an error of 0.1 rad counts as one of 6.2, and turning the short way is punished. Robots with a
+        free base are also turned by the check, all around the vertical.
     """,
     fix="Wrap the difference, (a - b + pi) % (2 * pi) - pi, or use 1 - cos(a - b).",
 )
@@ -36,17 +38,66 @@ RARE = 0.05  # the same of all other steps, relative to that of the passes
 _SHIFTS = [shift for shift in range(-NEIGHBOURS, NEIGHBOURS + 1) if shift]
 
 
-@judges_records(RULE, *rewards.WITH_SEARCH)
+TURNS, HALVINGS = 12, 10  # headings all around, and how often the interval of the largest change is halved
+TURNED_SEEDS = 2
+LARGE_JUMP = 0.5  # part of that change which is left then: of a smooth function it is a thousandth
+NEAR_PI = 0.01  # of where it is [rad]
+
+
+@judges_records(RULE, *rewards.WITH_SEARCH, "turned")
 def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     steps = collect_transitions(records)
     passes, pairs = _find_passes(steps), find_unit_pairs(steps.before)
     if not passes and not pairs:
+        if records.finished.get("turned") is not None and "turned" not in records.not_applicable:
+            return
         raise NotApplicable("no angle is observed that passes pi")
     jumps = _find_jumps(steps)
     size, where = _judge_passes(steps, passes, jumps) or _judge_errors(steps, pairs, jumps) or (0.0, "")
     if where:
         yield RuleFinding(RULE, f"the reward jumps by {size:.3g} {where}", {"value": size, "expected": "no jump"})
+
+
+@judges_turned(RULE, decides=False)
+def _turn_around(robot: TurnedRobot) -> Iterator[RuleFinding]:
+    """Yield a finding where the reward jumps at the heading pi, from whatever start."""
+    sizes: list[float] = []
+    for number in range(TURNED_SEEDS):
+        jump = _find_jump(robot, number)
+        if jump is None:
+            return
+        sizes.append(jump)
+    message = f"the reward jumps by {sizes[0]:.3g} where the heading of the robot passes from pi to -pi"
+    yield RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": sizes[0], "expected": "no jump"})
+
+
+def _find_jump(robot: TurnedRobot, number: int) -> float | None:
+    """Return how much the reward jumps at the heading pi; None if it is steady there, or jumps more elsewhere."""
+    start = robot.play(number, 0.0)
+    if start is None:
+        return None
+
+    def pay(heading: float) -> float:
+        step = robot.play(number, heading - start.heading)
+        return np.nan if step is None else step.reward
+
+    low, high = np.pi - np.pi / TURNS, np.pi + np.pi / TURNS
+    around = np.array([pay(heading) for heading in np.linspace(high, low + 2 * np.pi, TURNS)])
+    first, last = float(around[-1]), float(around[0])  # at `low` and at `high`
+    whole = abs(last - first)
+    if not whole > np.nanmax(np.abs(np.diff(around))):
+        return None
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        reward = pay(middle)
+        if abs(reward - first) > abs(last - reward):
+            high, last = middle, reward
+        else:
+            low, first = middle, reward
+    jump = abs(last - first)
+    is_at_pi = abs(low - np.pi) < NEAR_PI
+    return jump if is_at_pi and jump > LARGE_JUMP * whole else None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

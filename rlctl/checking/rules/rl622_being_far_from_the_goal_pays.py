@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.experiments.goals import (
+    MOST_SOURCES,
     GoalEpisode,
     GoalTrials,
     Numbers,
     Source,
     find_sources,
     judges_goals,
-    read_place,
 )
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
@@ -39,7 +39,6 @@ LATER_STEPS = 2  # with the goal moved: the first may pay the way to it as progr
 EPISODES, MOST_EPISODES = 3, 10  # that are needed, and that are tried
 FEWEST_MOVED = 0.02  # part of the goals' range: how far apart the robot is in these episodes
 RADII = (0.35, 0.7, 1.0)  # parts of the goals' range
-MOST_SOURCES = 24
 LEAST = 1e-6  # differences of rewards that count, of their size
 
 
@@ -105,7 +104,7 @@ def _find_source(trials: GoalTrials) -> tuple[Source | None, bool]:
     for source in sources[:MOST_SOURCES]:
         if episode.has_ended:
             episode = _begin(trials, 0)
-        for step in episode.play([_read_place(source, episode)]):
+        for step in episode.play([episode.read(source)]):
             reports_success |= step.succeeds is not None
             if step.succeeds:
                 return source, True
@@ -116,15 +115,11 @@ def _begin(trials: GoalTrials, number: int) -> GoalEpisode:
     return GoalEpisode(trials, FIRST_SEED + number, "repeated", FIRST_STEPS)
 
 
-def _read_place(source: Source, episode: GoalEpisode) -> Numbers:
-    return read_place(source, episode.observed[None], episode.goal[None])[0]
-
-
 def _measure(trials: GoalTrials, source: Source, number: int, offset: Numbers) -> _Outcome | None:
     """Return what a goal gives that stays as far from the robot, which moves as in the last step; None if the episode
     ended before, or had a success already."""
     episode = GoalEpisode(trials, FIRST_SEED + number, "repeated", FIRST_STEPS - 1)
-    before = _read_place(source, episode)
+    before = episode.read(source)
     episode.play([None])
     outcome = None
     if episode.has_succeeded:
@@ -132,7 +127,7 @@ def _measure(trials: GoalTrials, source: Source, number: int, offset: Numbers) -
     for _ in range(LATER_STEPS):
         if episode.has_ended:
             break
-        place = _read_place(source, episode)
+        place = episode.read(source)
         step = episode.step(2 * place - before + offset)
         before = place
         outcome = _Outcome(step.reward, bool(step.succeeds), episode.has_ended, place)

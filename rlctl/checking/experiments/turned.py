@@ -1,0 +1,145 @@
+"""The experiment `turned`: turns a free robot about the vertical, for rules about headings.
+
+Nothing but its heading is another one then: on level ground the robot moves as before, in another direction.
+"""
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_worlds import read_world
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiment import PROBE, JudgeHook, experiment
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.records import FIRST_SEED, ChildMessage
+from rlctl.checking.rule import NotApplicable, NotJudged
+from rlctl.checking.transitions import flatten_floats
+from rlctl.environments.bullet_clients import ClientCalls, find_clients
+from rlctl.environments.info import find_mujoco
+from rlctl.task.rotations import from_axis, multiply, roll_pitch_yaw, rotate
+
+FREE, PLANE = 0, 0  # MuJoCo's types of a joint and a geom
+UP = (0.0, 0.0, 1.0)
+ENDLESS = 1e5  # [m]; PyBullet's planes are larger
+LEVEL = 0.02  # how far static bodies may be above the lowest point of a robot [m]
+Numbers = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TurnedStep:
+    """What the first step returned, with the zero action."""
+
+    heading: float  # of the robot before it, from the engine [rad]
+    observed: Numbers  # The numbers that are floats. Shape (elements,)
+    reward: float  # NaN where it is no number
+
+
+@dataclasses.dataclass(frozen=True)
+class TurnedRobot:
+    """An instance whose only free robot can be turned."""
+
+    instance: Instance
+
+    def play(self, number: int, angle: float, speed: float = 0.0) -> TurnedStep | None:
+        """Reset with a seed, turn the robot by an angle [rad] about the vertical, let it move forwards at a speed
+        [m/s], and take a step; None where time is over."""
+        if self.instance.context.budget.is_over():
+            return None
+        player = EpisodePlayer(self.instance, FIRST_SEED + number, "zero", max_steps=1)
+        player.reset()
+        heading = _turn(self.instance.env, angle, speed)
+        moment = player.step()
+        observed = flatten_floats(self.instance.leaves, moment.observation)
+        return TurnedStep(heading, observed, moment.reward_number)
+
+
+judges_turned = JudgeHook[TurnedRobot]()
+"""Shows a robot on level ground that the parts turn."""
+
+
+@experiment("turned", PROBE, 112, share=0.5, hooks=(judges_turned,))
+def turn_robot(context: Context) -> Iterator[ChildMessage]:
+    """Find a free robot on level ground, and let the rules turn it."""
+    instance = context.instance
+    if not instance.accepts_seed:
+        raise NotJudged("reset takes no seed (RL202)")
+    EpisodePlayer(instance, FIRST_SEED, max_steps=0).reset()
+    if not _can_turn(instance.env):
+        raise NotApplicable("no robot with a free base on level ground, in PyBullet or MuJoCo")
+    robot = TurnedRobot(instance)
+    robot.play(0, 0.0)  # an instance's first episode may differ from all others
+    yield from judges_turned.judge(robot)
+
+
+def _can_turn(env: Any) -> bool:
+    if (simulation := find_mujoco(env)) is not None:
+        return _is_level(*simulation)
+    return len(_find_free_bodies()) == 1
+
+
+def _is_level(model: Any, data: Any) -> bool:
+    """Say whether all of the world is level planes, and one robot is free."""
+    is_static = model.body_weldid == 0
+    touches = (model.geom_contype | model.geom_conaffinity).astype(bool)
+    static = np.flatnonzero(is_static[model.geom_bodyid] & touches)
+    is_plane = all(model.geom_type[geom] == PLANE and data.geom_xmat[geom][8] > 1 - 1e-9 for geom in static)
+    roots = {int(root) for root in model.body_rootid[~is_static]}
+    return is_plane and len(roots) == 1 and int((model.jnt_type == FREE).sum()) == 1
+
+
+def _find_free_bodies() -> list[tuple[ClientCalls, int]]:
+    """Return the free bodies of PyBullet; none where something static is higher than the lowest point of one."""
+    found: list[tuple[ClientCalls, int]] = []
+    tops: list[float] = []
+    for client in find_clients():
+        p = ClientCalls(client)
+        for body in read_world(client).bodies:
+            if body.is_free:
+                found.append((p, body.id))
+            elif not _is_level_plane(p, body.id):
+                tops += [p.getAABB(body.id, link)[1][2] for link in range(-1, len(body.links) - 1)]
+    for p, body_id in found:
+        lowest = min(p.getAABB(body_id, link)[0][2] for link in range(-1, p.getNumJoints(body_id)))
+        if tops and max(tops) > lowest + LEVEL:
+            return []
+    return found
+
+
+def _is_level_plane(p: ClientCalls, body: int) -> bool:
+    """Say whether a body of PyBullet is without end, and not tilted."""
+    low, high = p.getAABB(body)
+    _, orientation = p.getBasePositionAndOrientation(body)
+    return bool(high[0] - low[0] > ENDLESS and rotate(orientation, UP)[2] > 1 - 1e-9)
+
+
+def _turn(env: Any, angle: float, speed: float) -> float:
+    """Turn the free robot about the vertical, and set its velocity; return its heading [rad]."""
+    if (simulation := find_mujoco(env)) is not None:
+        return _turn_in_mujoco(*simulation, angle, speed)
+    (p, body), *_ = _find_free_bodies()
+    place, orientation = p.getBasePositionAndOrientation(body)
+    linear, angular = p.getBaseVelocity(body)
+    turn = from_axis(UP, angle)
+    turned = multiply(turn, np.array(orientation))
+    heading = roll_pitch_yaw(turned.tolist())[2]
+    p.resetBasePositionAndOrientation(body, place, turned.tolist())
+    velocity = rotate(turn, linear) + speed * np.array([np.cos(heading), np.sin(heading), 0.0])
+    p.resetBaseVelocity(body, velocity.tolist(), rotate(turn, angular).tolist())
+    return float(heading)
+
+
+def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float) -> float:
+    (joint,) = np.flatnonzero(model.jnt_type == FREE)
+    place, first = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+    turn = from_axis(UP, angle)
+    turned = multiply(turn, np.roll(data.qpos[place + 3 : place + 7], -1))
+    heading = roll_pitch_yaw(turned.tolist())[2]
+    data.qpos[place + 3 : place + 7] = np.roll(turned, 1)
+    data.qvel[first : first + 3] = rotate(turn, data.qvel[first : first + 3])
+    data.qvel[first : first + 2] += speed * np.array([np.cos(heading), np.sin(heading)])
+    sys.modules["mujoco"].mj_forward(model, data)
+    return float(heading)

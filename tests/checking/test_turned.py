@@ -1,0 +1,44 @@
+"""RL123, RL124, RL618: robots with a free base whose heading matters."""
+
+import pytest
+
+from tests.checking.judging import case, check_case, findings, mark_slow
+
+pytest.importorskip("mujoco")
+
+
+def broken(name, twin, rule, **settings):
+    file = "mujoco_robots.py" if twin == "MujocoHopper" else "broken_turned.py"
+    return case(f"broken_turned.py:{name}", (rule, "warning"), twin=f"{file}:{twin}", **settings)
+
+
+CASES = [
+    broken("RL123FlyerNorth", "Flyer", "RL123"),
+    broken("RL123CartNorth", "Cart", "RL123"),
+    broken("RL123HopperNorth", "MujocoHopper", "RL123", slow=True),
+    broken("RL123CrawlerNorth", "CrawlerLooks", "RL123", pybullet=True),
+    broken("RL123PuckNorth", "Puck", "RL123", pybullet=True),
+    broken("RL124FlyerWrongWay", "Flyer", "RL124"),
+    broken("RL124CartWrongWay", "Cart", "RL124"),
+    broken("RL124HopperTurnsTwice", "MujocoHopper", "RL124", slow=True),
+    broken("RL124CrawlerWrongWay", "CrawlerTurns", "RL124", pybullet=True),
+    broken("RL124PuckWrongWay", "Puck", "RL124", pybullet=True),
+    broken("RL618FlyerLooksRound", "FlyerLooks", "RL618"),
+    broken("RL618CartLooksRound", "CartLooks", "RL618"),
+    broken("RL618HopperLooksRound", "HopperLooks", "RL618", slow=True),
+    broken("RL618CrawlerLooksRound", "CrawlerLooksAway", "RL618", pybullet=True),
+    broken("RL618PuckLooksRound", "PuckLooks", "RL618", pybullet=True),
+]
+
+
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.slow
+def test_a_robot_that_always_begins_with_the_same_heading_is_an_info():
+    (finding,) = findings("broken_turned.py:FlyerNorthAlwaysTheSame", "RL123")
+    assert finding.severity == "info"
+    # North is along x: from backwards to forwards at 0.5 m/s.
+    assert finding.evidence["value"] == pytest.approx(1.0, abs=0.1)
