@@ -25,7 +25,7 @@ from rlctl.policy.actor import Actor, Rows
 from rlctl.replaying.bullet_scene import TaskReader, WorldsReader
 from rlctl.replaying.drawable import DrawableEnv
 from rlctl.replaying.mujoco_scene import MujocoReader
-from rlctl.replaying.scene import Camera, Env, Scene, Warn
+from rlctl.replaying.scene import Env, RenderedScene, Scene, Warn
 from rlctl.task.env import TaskEnv
 from rlctl.task.worlds import WorldsStep
 from rlctl.version import collect_versions
@@ -95,7 +95,7 @@ class _PlainReader:
                 return worlds
             if env.no_pictures:
                 self._warn(f"no camera pictures: {env.no_pictures}")
-        return Camera(env, self._warn)
+        return RenderedScene(env, self._warn)
 
     def scene(self) -> Scene:
         return self._reader.scene()

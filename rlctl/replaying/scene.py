@@ -101,8 +101,8 @@ class Scene:
         return sorted(dict.fromkeys(names), key=lambda name: name != WORLD)
 
 
-class Camera:
-    """Takes pictures of an environment, in long episodes only every few steps; stops after the first error."""
+class RenderedScene:
+    """What `render` of an environment returns, in long episodes only every few steps; stops at the first error."""
 
     def __init__(self, env: Env, warn: Warn) -> None:
         self._env = env
