@@ -29,13 +29,15 @@ from rlctl_robot.identify.robot_model import (
     stack_values,
 )
 from rlctl_robot.identify.unknowns import DEFAULT, QUANTITIES, Unknown, UnknownValues, list_unknowns
-from rlctl_robot.identify.window_fit import WindowFit, WindowFitter
+from rlctl_robot.identify.window_fit import ENOUGH, WindowFit, WindowFitter
 from rlctl_robot.identify.windows import WindowPlayer
 
 _WINDOW_S = 1.0
 _PARTS = 5  # of a log; the end of each is held out
 _HELD_OUT = 0.2  # of each part
 _LEAST_WINDOWS = 4
+_FEW = 3  # one in so many windows, to which the values are fitted first
+_ENOUGH_OF_FEW = 20.0
 _LEAST_MOTION = 0.02  # [rad or m], of a joint that moves
 _LARGEST_ERROR = 0.5  # of the difference of target and position, that may stay unexplained in a joint
 _NOISE_RATIO = 3.0
@@ -118,14 +120,14 @@ def identify_robot(
     is_held_out = _hold_out(motion)
     regression = Regression(robot, motion, np.flatnonzero(~is_held_out))
     check_model(regression, motion, moving)
-    start = _hold_still(regression.guess("stiffness" in chosen), motion, moving)
+    guess = regression.guess("stiffness" in chosen)
+    start = robot.nominal | {QUANTITIES[name]: guess[QUANTITIES[name]] for name in chosen}
+    start = _hold_still(start, motion, moving)
     unknowns = list_unknowns(robot, start, chosen, moving)
     player = WindowPlayer(robot, motion.commands, motion.control_dt, threads)
     starts, steps = _choose_windows(motion, is_held_out)
     report(f"{len(unknowns.items)} values, {len(starts)} windows of {steps * motion.control_dt:.2g} s")
-    derivatives = differentiate(motion)
-    fitter = WindowFitter(player, unknowns, motion.positions, derivatives.velocities, starts, steps)
-    found = fitter.fit(report)
+    found = _fit(player, unknowns, motion, starts, steps, report)
     after: Values = {name: value[0] for name, value in unknowns.values(found.vector[None]).items()}
     before = _hold_still(_take_nominal(robot, after), motion, moving)
     report("held-out rows")
@@ -160,6 +162,27 @@ def identify_robot(
         joints=robot.joints,
         is_held_out=is_held_out,
     )
+
+
+def _fit(
+    player: WindowPlayer,
+    unknowns: UnknownValues,
+    motion: Motion,
+    starts: Array,
+    steps: int,
+    report: Callable[[str], None],
+) -> WindowFit:
+    """Fit the values to some of the windows, and then to all of them, which needs few steps then."""
+    velocities = differentiate(motion).velocities
+    vector = unknowns.column("first")
+    for every, enough in ((_FEW, _ENOUGH_OF_FEW), (1, ENOUGH)):
+        chosen = starts[::every]
+        if every > 1 and len(chosen) < _LEAST_WINDOWS:
+            continue
+        fitter = WindowFitter(player, unknowns, motion.positions, velocities, chosen, steps)
+        found = fitter.fit(vector, report, enough)
+        vector = found.vector
+    return found
 
 
 def _check_stiffness(robot: RobotModel, chosen: Collection[str]) -> None:

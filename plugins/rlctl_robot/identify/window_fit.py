@@ -15,7 +15,7 @@ from rlctl_robot.identify.unknowns import UnknownValues
 from rlctl_robot.identify.windows import WindowPlayer
 
 _MOST_ITERATIONS = 15
-_ENOUGH = 0.5  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
+ENOUGH = 0.5  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
 _NEAR = 0.2  # relative decrease of the cost, below which derivatives hold for the next step too
 _DAMPINGS = (0.01, 0.1, 1.0, 10.0, 1000.0)  # factors of the last damping, tried in one batch
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-9, 1e6
@@ -86,15 +86,12 @@ class WindowFitter:
         self._places = np.array([int(np.sum(trees[:joint] == trees[joint])) for joint in range(len(trees))])
         self._same_tree = trees[:, None] == trees
 
-    def fit(self, report: Callable[[str], None] = lambda _: None) -> WindowFit:
-        """Return the best values near the first guess of the unknowns."""
-        vector = np.maximum(self._center, self._lowest)
-        point = self._play([(vector, *self._first)])[0]
-        damping, derivatives = _FIRST_DAMPING, None
+    def fit(self, vector: Array, report: Callable[[str], None], enough: float = ENOUGH) -> WindowFit:
+        """Return the best values near a first guess, shape (unknowns,); `enough` is the last step's decrease."""
+        point = self._play([(np.maximum(vector, self._lowest), *self._first)])[0]
+        damping, is_new = _FIRST_DAMPING, True
+        derivatives = self._differentiate(point)
         for iteration in range(_MOST_ITERATIONS):
-            is_new = derivatives is None
-            if derivatives is None:
-                derivatives = self._differentiate(point)
             noise = self._estimate_noise(point.errors)
             equations = self._form_equations(point, derivatives, noise)
             cost = self._compute_cost(point, noise)
@@ -106,15 +103,15 @@ class WindowFitter:
             if decrease > 0:
                 point, damping = candidates[best], float(dampings[best])
             report(f"step {iteration + 1}: remaining error {np.sqrt(np.square(point.errors).mean()):.3g}")
-            if is_new and decrease <= 0:
-                if damping >= _MOST_DAMPING:
+            if is_new and decrease < enough:
+                if decrease > 0 or damping >= _MOST_DAMPING:
                     break
                 damping = min(1000.0 * damping, _MOST_DAMPING)
-            elif is_new and decrease < _ENOUGH:
-                break
-            elif decrease > _NEAR * cost or decrease < _ENOUGH:
-                derivatives = None
-        return self._finish(point)
+                continue
+            is_new = decrease > _NEAR * cost or decrease < enough
+            if is_new:
+                derivatives = self._differentiate(point)
+        return self._finish(point, derivatives)
 
     def _play(self, starts: list[tuple[Array, Array, Array]]) -> list[_Point]:
         """Simulate all windows for several values and start states in one batch."""
@@ -216,9 +213,9 @@ class WindowFitter:
             point.velocities + moved[:, joints:],
         )
 
-    def _finish(self, point: _Point) -> WindowFit:
+    def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
         noise = self._estimate_noise(point.errors)
-        equations = self._form_equations(point, self._differentiate(point), noise)
+        equations = self._form_equations(point, derivatives, noise)
         information, gradients, _ = self._reduce(equations, 0.0)
         known = np.diag(1.0 / np.square(self._doubt))
         inverse = np.linalg.inv(information + known)
