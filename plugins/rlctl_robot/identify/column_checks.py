@@ -1,5 +1,6 @@
 """Columns of a log with another sign, order or unit than the robot's joints: named, not fitted."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -14,7 +15,10 @@ from rlctl_robot.identify.motion import Motion
 _LATEST_S = 0.2  # by which a position may follow its command late
 _WEAK, _CLEAR = 0.5, 0.8  # correlations of a position with its own command, and with that of another joint
 _DEGREES = (30.0, 110.0)  # factor between a command and its position, where one of them is in degrees
-_UNEXPLAINED, _EXPLAINED = 0.35, 0.4  # share of a joint's difference; factor by which another sign must reduce it
+_CLEARER = math.log(3.0)
+"""By so much another sign or order must explain more for each joint that it changes: a third of the rest remains."""
+_MOST_CHANGED = 2
+_LEAST_SHARE = 1e-4
 
 
 def check_commands(motion: Motion, moving: Sequence[int]) -> None:
@@ -70,36 +74,38 @@ def _standardise(values: Array) -> Array:
 
 
 def check_model(regression: Regression, motion: Motion, moving: Sequence[int]) -> None:
-    """Raise `AnswerIsNo` if gravity and inertia fit only when joints of the log have another sign or order."""
+    """Raise `AnswerIsNo` if gravity and inertia fit far better when joints of the log have another sign or order."""
     robot = regression.robot
     count = len(robot.joints)
     straight = list(range(count))
-    found = regression.unexplained(np.ones(count), straight)
-    bad = [joint for joint in moving if found[joint] > _UNEXPLAINED]
-    if not bad:
-        return
-    alternatives: list[tuple[str, Array, list[int], list[int]]] = []
-    for joint in bad:
+    alternatives = [_Alternative("", np.ones(count), straight, 0)]
+    for joint in moving:
         signs = np.ones(count)
         signs[joint] = -1
-        text = f"of {robot.joints[joint]} have another sign than in {robot.path.name}; give their scale, -1"
-        alternatives.append((text, signs, straight, [joint]))
-    alternatives.append((f"of all joints have another sign than in {robot.path.name}", -np.ones(count), straight, bad))
+        text = f"of {robot.joints[joint]} have another sign than in {robot.path.name}: give their scale, -1,"
+        alternatives.append(_Alternative(text, signs, straight, 1))
+    text = f"of all joints have another sign than in {robot.path.name}: give their scale, -1,"
+    alternatives.append(_Alternative(text, -np.ones(count), straight, _MOST_CHANGED))
     for one, other in itertools.combinations(moving, 2):
-        if one in bad or other in bad:
-            order = list(straight)
-            order[one], order[other] = other, one
-            text = f"of {robot.joints[one]} and {robot.joints[other]} are exchanged"
-            alternatives.append((text, np.ones(count), order, [one, other]))
-    results = []
-    for text, signs, order, changed in alternatives:
-        shares = regression.unexplained(signs, order)
-        results.append((float(shares[list(moving)].sum()), text, float(shares[changed].max())))
-    total, text, share = min(results)
-    before = float(found[list(moving)].sum())
-    if share < _UNEXPLAINED and total < before - _EXPLAINED * float(found[bad].sum()):
+        order = list(straight)
+        order[one], order[other] = other, one
+        text = f"of {robot.joints[one]} and {robot.joints[other]} are exchanged: give them"
+        alternatives.append(_Alternative(text, np.ones(count), order, 2))
+    shares = [regression.unexplained(each.signs, each.order)[list(moving)] for each in alternatives]
+    scores = np.array([np.log(np.maximum(share, _LEAST_SHARE)).sum() for share in shares])
+    gains = scores[0] - scores - _CLEARER * np.array([each.changed for each in alternatives])
+    best = int(gains.argmax())
+    if best > 0 and gains[best] > 0:
         raise AnswerIsNo(
-            f"{motion.table.path}: the columns {text}, in --columns FILE: gravity and inertia explain "
-            f"{max(0.0, 1 - before / len(moving)):.0%} of the servos' errors as they are, and "
-            f"{max(0.0, 1 - total / len(moving)):.0%} then"
+            f"{motion.table.path}: the columns {alternatives[best].text} in --columns FILE (of the difference between "
+            f"targets and positions, gravity, inertia and friction leave {np.exp(scores[0] / len(moving)):.1%} "
+            f"unexplained as they are, and {np.exp(scores[best] / len(moving)):.1%} then)"
         )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Alternative:
+    text: str
+    signs: Array
+    order: Sequence[int]
+    changed: int  # joints, for each of which it must explain more

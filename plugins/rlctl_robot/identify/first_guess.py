@@ -30,6 +30,7 @@ _SLOW = 0.05  # [rad/s or m/s], below which the sign of a velocity is uncertain
 _DELAYS = np.arange(0.0, 0.121, 0.005)  # [s]
 _LEAST_SHARE = 0.05  # of the difference that torques must explain, for the stiffness to follow from it
 _MOST_ROWS = 6000
+_COMPARED_ROWS, _COMPARED_DELAYS = 1000, 4  # of a comparison of signs and orders: every fourth delay
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,14 +90,14 @@ class Regression:
 
     def unexplained(self, signs: Array, order: Sequence[int]) -> Array:
         """Return the unexplained share of each joint if columns had other signs and another order, (joints,)."""
-        changed = Derivatives(
-            *(getattr(self._derivatives, field.name)[:, order] * signs for field in dataclasses.fields(Derivatives))
-        )
+        few = slice(None, None, max(1, len(self.rows) // _COMPARED_ROWS))
+        fields = [getattr(self._derivatives, field.name) for field in dataclasses.fields(Derivatives)]
+        changed = Derivatives(*(values[few][:, order] * signs for values in fields))
         torques = self._compute_torques(changed)
         joints = range(len(self.robot.joints))
         shares = [
-            [self._fit_one(changed, joint, torques, commands[:, order] * signs, True)[1] for joint in joints]
-            for commands in self._delayed[::2]
+            [self._fit_one(changed, joint, torques, commands[few][:, order] * signs, True)[1] for joint in joints]
+            for commands in self._delayed[::_COMPARED_DELAYS]
         ]
         best = int(np.argmin(np.sum(shares, axis=1)))
         return np.array(shares[best])

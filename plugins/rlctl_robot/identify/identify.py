@@ -15,7 +15,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.play.workers import available_cores
 from rlctl_robot.identify.follow import Follower, Unknowns, describe_expected, find_unknowns, open_world
-from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown
+from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise
 from rlctl_robot.identify.log import Array, Log, check_actions, read_log
 from rlctl_robot.identify.search import Fit, search, start_search_workers
 
@@ -139,8 +139,7 @@ def identify(
 def _check_errors(file: Path, follower: Follower, log: Log, before: float, after: float) -> None:
     """Raise `AnswerIsNo` where the simulation does not follow the log: its values are those of another motion."""
     motion = _root_mean_squares(follower.motion)[0]
-    # Third differences remove the motion; they have 1 + 9 + 9 + 1 times the variance of the noise.
-    noise = float(np.sqrt(np.square(np.diff(log.positions, 3, axis=0)).mean() / 20))
+    noise = float(np.sqrt(np.square(measure_noise(log.positions)).mean()))
     if after > max(_LARGEST_ERROR * motion, _NOISE_RATIO * noise):
         raise AnswerIsNo(
             f"{file}: the task does not explain this log: the simulated positions are wrong by {after:.3g} rad "

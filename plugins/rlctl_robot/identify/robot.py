@@ -11,7 +11,7 @@ from rlctl.errors import AnswerIsNo, UsageError, check_name
 from rlctl.task.model_files import find_model_file
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression, differentiate
-from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown
+from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise
 from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.motion import Motion, check_positions, read_motion
 from rlctl_robot.identify.robot_model import (
@@ -133,7 +133,7 @@ def identify_robot(
     report("held-out rows")
     errors = play_through(player, motion, [before, after])[:, is_held_out]
     by_joint = np.sqrt(np.square(errors).mean(axis=1))
-    bad = _find_unexplained(motion, found, by_joint[1], is_held_out, moving, after)
+    bad = _find_unexplained(motion, by_joint[1], is_held_out, moving, after)
     if len(bad) == len(moving):
         raise AnswerIsNo(
             f"{log}: {path.name} does not explain this log: the simulated positions of every joint are wrong by more "
@@ -265,13 +265,13 @@ def play_through(player: WindowPlayer, motion: Motion, candidates: list[Values])
 
 
 def _find_unexplained(
-    motion: Motion, found: WindowFit, errors: Array, is_held_out: Array, moving: Collection[int], after: Values
+    motion: Motion, errors: Array, is_held_out: Array, moving: Collection[int], after: Values
 ) -> list[int]:
     """Return the joints that the simulation does not follow with the best values."""
     late = round(float(after[DELAY]) / motion.control_dt)
     commands = np.roll(motion.commands, late, axis=0)
     differences = np.std((commands - motion.positions)[is_held_out], axis=0)
-    allowed = np.maximum(_LARGEST_ERROR * differences, _NOISE_RATIO * found.noise)
+    allowed = np.maximum(_LARGEST_ERROR * differences, _NOISE_RATIO * measure_noise(motion.positions))
     return [joint for joint in moving if not errors[joint] <= allowed[joint]]
 
 
