@@ -41,6 +41,14 @@ def identify(
         Path | None,
         Option("Of a model file: columns of the log, their scale and offset (YAML), as of diagnose.", metavar="FILE"),
     ] = None,
+    timestep: Annotated[
+        float | None,
+        Option(
+            "Of a model file: physics step in seconds, that of your task. Default: the file's, of a URDF 0.004.",
+            min=0.0005,
+            max=0.005,
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         Option(
@@ -73,19 +81,22 @@ def identify(
     if (log is None) == (excite is None):
         raise UsageError("give either --excite FILE or --log FILE")
     if not is_model_file(task):
-        _refuse({"--fit": fit, "--columns": columns, "--output": output}, "a robot's model file (.xml, .urdf)")
+        _refuse(
+            {"--fit": fit, "--columns": columns, "--timestep": timestep, "--output": output},
+            "a robot's model file (.xml, .urdf)",
+        )
         _identify_task(task, log, excite, events, seconds or 10.0, settings, sim, seed, json)
         return
     _refuse({"--event": events, "--set": settings, "--sim": sim}, "a task")
     if excite is not None:
         from rlctl_robot.identify.robot_excite import show_robot_excitation, write_robot_excitation
 
-        _refuse({"--fit": fit, "--columns": columns, "--output": output}, "--log")
+        _refuse({"--fit": fit, "--columns": columns, "--timestep": timestep, "--output": output}, "--log")
         found = write_robot_excitation(task, excite, seconds=seconds or 60.0, rate=rate, seed=seed)
         show_robot_excitation(found, json)
         return
     assert log is not None
-    _identify_robot(task, log, fit, columns, output, json)
+    _identify_robot(task, log, fit, columns, timestep, output, json)
 
 
 def _refuse(options: dict[str, object], needed: str) -> None:
@@ -96,14 +107,25 @@ def _refuse(options: dict[str, object], needed: str) -> None:
 
 
 def _identify_robot(
-    file: str, log: Path, fit: list[str], columns: Path | None, folder: Path | None, json: str | None
+    file: str,
+    log: Path,
+    fit: list[str],
+    columns: Path | None,
+    timestep: float | None,
+    folder: Path | None,
+    json: str | None,
 ) -> None:
     from rlctl import output
     from rlctl_robot.identify.robot import identify_robot
     from rlctl_robot.identify.robot_report import show_robot, write_robot
 
     result = identify_robot(
-        file, log, columns=columns, fit=fit, report=lambda line: output.err().print(f"identify: {line}")
+        file,
+        log,
+        columns=columns,
+        fit=fit,
+        timestep=timestep,
+        report=lambda line: output.err().print(f"identify: {line}"),
     )
     output.print_notes(result.notes)
     written = [] if folder is None else write_robot(result, folder)

@@ -94,12 +94,13 @@ def identify_robot(
     *,
     columns: Path | None = None,
     fit: Collection[str] = (),
+    timestep: float | None = None,
     threads: int = 0,
     report: Callable[[str], None] = lambda _: None,
 ) -> RobotIdentification:
     """Estimate the servos' values of a robot in a model file from a log of commands and positions.
 
-    `fit` names quantities of `QUANTITIES` (default: all but the masses). Raises `ArtifactError` for an invalid log,
+    `fit` names quantities of `QUANTITIES` (default: all but the masses), `timestep` is the physics step [s]. Raises `ArtifactError` for an invalid log,
     `AnswerIsNo` if columns have another sign, order or unit than the robot, or if the log tells none of the values.
     """
     chosen = tuple(fit) or DEFAULT
@@ -107,7 +108,7 @@ def identify_robot(
         check_name(name, QUANTITIES, "--fit: no quantity", UsageError)
     path = find_model_file(file)
     motion = read_motion(log, list_servo_joints(path), columns)
-    robot = read_robot(path, motion.joints)
+    robot = read_robot(path, motion.joints, timestep=timestep)
     check_positions(motion, robot)
     _check_stiffness(robot, chosen)
     moving = _find_moving(motion)

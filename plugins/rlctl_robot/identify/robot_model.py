@@ -18,7 +18,8 @@ ARMATURE, COULOMB, VISCOUS = "armature_kgm2", "coulomb_friction_nm", "viscous_fr
 BIAS, DELAY, MASS = "encoder_bias_rad", "delay_s", "mass_factor"
 OF_JOINTS = (STIFFNESS, ARMATURE, VISCOUS, COULOMB, BIAS)
 """Values of each joint, with the names of `rlctl.task.motors.Motor`."""
-_SHORTEST_STEP, _LONGEST_STEP = 0.001, 0.005  # [s], of the physics
+_SHORTEST_STEP, _LONGEST_STEP = 0.0005, 0.005  # [s], of the physics
+_USUAL_STEP = 0.004  # of tasks with a URDF, which has none
 _FRICTION = (0.999, 0.999, 0.001, 0.5, 2)
 """Impedance of dry friction, as of `set_motors`: with MuJoCo's default a joint that friction holds creeps."""
 _LEAST_MASS = 0.01  # of the heaviest link, of a link whose mass can be estimated
@@ -77,10 +78,12 @@ def _compile(path: Path, spec: Any) -> Any:
         raise TaskError(f"MuJoCo cannot load {path}: {' '.join(str(error).split())}") from None
 
 
-def read_robot(file: str | Path, joints: Sequence[str] = (), *, collides: bool = False) -> RobotModel:
+def read_robot(
+    file: str | Path, joints: Sequence[str] = (), *, timestep: float | None = None, collides: bool = False
+) -> RobotModel:
     """Read a robot with a servo at each of `joints` (default: all that have one); the others are locked.
 
-    Its base is fixed where the file has it. Raises `TaskError` for a file that cannot be read, `UsageError` for a
+    Its base is fixed where the file has it. The physics step is `timestep` [s], or the file's. Raises `TaskError` for a file that cannot be read, `UsageError` for a
     joint that is not there.
     """
     path = find_model_file(file)
@@ -97,8 +100,8 @@ def read_robot(file: str | Path, joints: Sequence[str] = (), *, collides: bool =
             geom.contype = geom.conaffinity = 0
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     if path.suffix == ".urdf":
-        spec.option.timestep = 0.002  # MuJoCo's default; a URDF has none
-    spec.option.timestep = float(np.clip(spec.option.timestep, _SHORTEST_STEP, _LONGEST_STEP))
+        spec.option.timestep = _USUAL_STEP
+    spec.option.timestep = float(np.clip(timestep or spec.option.timestep, _SHORTEST_STEP, _LONGEST_STEP))
     for name in kept:
         _add_servo(spec, name, servos[name], source)
     model = _compile(path, spec)

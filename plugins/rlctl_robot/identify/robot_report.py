@@ -33,6 +33,12 @@ _TITLES = {
     BIAS: "bias\n[rad]",
     MASS: "mass\n[factor]",
 }
+_EVENTS = (
+    (COULOMB, "motor_friction", "coulomb_nm"),
+    (BIAS, "motor_bias", "bias_rad"),
+    (DELAY, "motor_delay", "delay_s"),
+)
+"""Quantities, the events that change them, and their parameters."""
 _UNKNOWN = "cannot tell"
 _MIN_WIDTH = 0.02
 """Smallest half width of a range for training, relative to the value: intervals leave out the model's errors."""
@@ -40,7 +46,8 @@ _MIN_WIDTH = 0.02
 
 def show_robot(result: RobotIdentification, written: list[Path], json: str | None) -> None:
     """Print the values with their intervals, or write them as JSON to a file or, for `-`, to stdout."""
-    if output.present({**describe(result), "motors": make_motors(result), "ranges": make_ranges(result)}, json):
+    parts = {"motors": make_motors(result), "ranges": make_ranges(result), "events": make_events(result)}
+    if output.present({**describe(result), **parts}, json):
         return
     out = output.out()
     out.print(f"{result.robot}: {result.log}, {result.rows:,} rows, {result.seconds:.1f} s")
@@ -109,13 +116,33 @@ def make_ranges(result: RobotIdentification) -> dict[str, dict[str, list[float]]
     return ranges
 
 
+def make_events(result: RobotIdentification) -> dict[str, dict[str, list[float]]]:
+    """Return ranges of the events of motors (`rlctl.task.events`), which hold for all joints whose value is known."""
+    ranges = list(make_ranges(result).values())
+    events: dict[str, dict[str, list[float]]] = {}
+    for quantity, event, key in _EVENTS:
+        intervals = [interval for part in ranges for name, interval in part.items() if name == quantity]
+        if intervals:
+            lowest, highest = np.array(intervals).min(axis=0)[0], np.array(intervals).max(axis=0)[1]
+            events[event] = {key: [_round(float(lowest)), _round(float(highest))]}
+    factors = [
+        (value.low / value.value, value.high / value.value)
+        for value in result.values
+        if value.known and value.quantity == STIFFNESS
+    ]
+    if factors:
+        low, high = min(low for low, _ in factors), max(high for _, high in factors)
+        events["torque_constant"] = {"factor": [_round(min(low, 1 - _MIN_WIDTH)), _round(max(high, 1 + _MIN_WIDTH))]}
+    return events
+
+
 def write_robot(result: RobotIdentification, folder: Path) -> list[Path]:
     """Write the robot as MJCF with the values found, and `NAME.motors.yaml` for `set_motors`; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     model = folder / f"{result.robot.stem}.identified.xml"
     motors = folder / f"{result.robot.stem}.motors.yaml"
     files.write_text(model, make_mjcf(result))
-    content = {"motors": make_motors(result), "ranges": make_ranges(result)}
+    content = {"motors": make_motors(result), "ranges": make_ranges(result), "events": make_events(result)}
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
     files.write_text(motors, f"# rlctl identify {result.robot.name} --log {result.log.name}\n{text}")
     return [model, motors]

@@ -121,6 +121,10 @@ def test_values_are_written_as_a_model_and_for_set_motors(identified, tmp_path):
     assert low <= 0.9801 * written["motors"]["shoulder"][STIFFNESS]  # the model's errors are not in an interval
     assert high >= 1.0199 * written["motors"]["shoulder"][STIFFNESS]
     assert len(written["ranges"]["all"][DELAY]) == 2
+    low, high = written["events"]["motor_friction"]["coulomb_nm"]
+    assert low < 0.3 < 0.6 < high
+    assert written["events"]["motor_delay"]["delay_s"] == written["ranges"]["all"][DELAY]
+    assert written["events"]["torque_constant"]["factor"] == [0.98, 1.02]
     show_robot(identified, paths, str(tmp_path / "found.json"))
     found = json.loads((tmp_path / "found.json").read_text())
     assert {value["quantity"] for value in found["values"]} == set(HIDDEN)
