@@ -100,8 +100,9 @@ def identify_robot(
 ) -> RobotIdentification:
     """Estimate the servos' values of a robot in a model file from a log of commands and positions.
 
-    `fit` names quantities of `QUANTITIES` (default: all but the masses), `timestep` is the physics step [s]. Raises `ArtifactError` for an invalid log,
-    `AnswerIsNo` if columns have another sign, order or unit than the robot, or if the log tells none of the values.
+    `fit` names quantities of `QUANTITIES` (default: all but the masses), `timestep` is the physics step [s]. Raises
+    `ArtifactError` for an invalid log, `AnswerIsNo` if columns have another sign, order or unit than the robot, or if
+    the log tells none of the values.
     """
     chosen = tuple(fit) or DEFAULT
     for name in chosen:

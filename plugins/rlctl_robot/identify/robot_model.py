@@ -83,8 +83,8 @@ def read_robot(
 ) -> RobotModel:
     """Read a robot with a servo at each of `joints` (default: all that have one); the others are locked.
 
-    Its base is fixed where the file has it. The physics step is `timestep` [s], or the file's. Raises `TaskError` for a file that cannot be read, `UsageError` for a
-    joint that is not there.
+    Its base is fixed where the file has it. The physics step is `timestep` [s], or the file's. Raises `TaskError` for a
+    file that cannot be read, `UsageError` for a joint that is not there.
     """
     path = find_model_file(file)
     source = read_model_file(path, fixed=True, visuals=False)
