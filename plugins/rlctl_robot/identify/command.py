@@ -31,8 +31,8 @@ def identify(
     fit: Annotated[
         list[str],
         Option(
-            "Of a model file: estimate this quantity only (stiffness, armature, viscous, coulomb, bias, delay, mass); "
-            "repeatable. Default: all but mass.",
+            "Of a model file: estimate this quantity only (stiffness, armature, viscous, coulomb, bias, delay, "
+            "backlash, mass); repeatable. Default: all but the last two.",
             ("--fit",),
             metavar="NAME",
         ),

@@ -72,6 +72,11 @@ class Regression:
         )
         self._delayed = [self._delay_commands(delay) for delay in _DELAYS]
 
+    def find_sides(self) -> Array:
+        """Return on which side of its play each link lies in the rows, -1 or 1: where its load pushes it."""
+        sides: Array = -np.sign(self._compute_torques(self._derivatives))
+        return sides
+
     def guess(self, fits_stiffness: bool) -> Values:
         """Return the values that explain the log best."""
         torques = self._compute_torques(self._derivatives)

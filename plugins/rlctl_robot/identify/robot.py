@@ -16,6 +16,7 @@ from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.motion import Motion, check_positions, read_motion
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
+    BACKLASH,
     BIAS,
     COULOMB,
     DELAY,
@@ -42,7 +43,8 @@ _LEAST_MOTION = 0.02  # [rad or m], of a joint that moves
 _LARGEST_ERROR = 0.5  # of the difference of target and position, that may stay unexplained in a joint
 _NOISE_RATIO = 3.0
 _STILL = 1e6  # armature and damping that hold a joint where it is
-_MIN_KNOWN = {BIAS: 0.02, DELAY: 0.004}
+_FIRST_BACKLASH = 0.01  # [rad or m]
+_MIN_KNOWN = {BIAS: 0.02, BACKLASH: 0.005, DELAY: 0.004}
 """Half widths of intervals [rad, s] at which values that may be 0 count as known."""
 _SMALL_FRICTION = 0.02  # of the torques of a joint: a friction known as well as this is known, even if it is 0
 
@@ -122,11 +124,11 @@ def identify_robot(
     is_held_out = _hold_out(motion)
     regression = Regression(robot, motion, np.flatnonzero(~is_held_out))
     check_model(regression, motion, moving)
-    guess = regression.guess("stiffness" in chosen)
+    guess = regression.guess("stiffness" in chosen) | {BACKLASH: np.full(len(robot.joints), _FIRST_BACKLASH)}
     start = robot.nominal | {QUANTITIES[name]: guess[QUANTITIES[name]] for name in chosen}
     start = _hold_still(start, motion, moving)
     unknowns = list_unknowns(robot, start, chosen, moving)
-    player = WindowPlayer(robot, motion.commands, motion.control_dt, threads)
+    player = _make_player(robot, motion, regression, chosen, threads)
     starts, steps = _choose_windows(motion, is_held_out)
     report(f"{len(unknowns.items)} values, {len(starts)} windows of {steps * motion.control_dt:.2g} s")
     found = _fit(player, unknowns, motion, starts, steps, report)
@@ -164,6 +166,19 @@ def identify_robot(
         joints=robot.joints,
         is_held_out=is_held_out,
     )
+
+
+def _make_player(
+    robot: RobotModel, motion: Motion, regression: Regression, chosen: Collection[str], threads: int
+) -> WindowPlayer:
+    if "backlash" not in chosen:
+        return WindowPlayer(robot, motion.commands, motion.control_dt, threads)
+    with_play = read_robot(robot.path, robot.joints, timestep=robot.model.opt.timestep, plays=True)
+    player = WindowPlayer(with_play, motion.commands, motion.control_dt, threads)
+    # Rows without a side, which are held out, have that of the row before.
+    nearest = np.searchsorted(regression.rows, np.arange(len(motion.commands)), side="right") - 1
+    player.sides = regression.find_sides()[np.maximum(nearest, 0)]
+    return player
 
 
 def _fit(

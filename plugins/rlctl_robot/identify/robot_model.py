@@ -15,13 +15,14 @@ from rlctl_robot.identify.log import Array
 
 STIFFNESS, DAMPING = "stiffness_nm_per_rad", "damping_nms_per_rad"
 ARMATURE, COULOMB, VISCOUS = "armature_kgm2", "coulomb_friction_nm", "viscous_friction_nms_per_rad"
-BIAS, DELAY, MASS = "encoder_bias_rad", "delay_s", "mass_factor"
-OF_JOINTS = (STIFFNESS, ARMATURE, VISCOUS, COULOMB, BIAS)
+BIAS, BACKLASH, DELAY, MASS = "encoder_bias_rad", "backlash_rad", "delay_s", "mass_factor"
+OF_JOINTS = (STIFFNESS, ARMATURE, VISCOUS, COULOMB, BIAS, BACKLASH)
 """Values of each joint, with the names of `rlctl.task.motors.Motor`."""
 _SHORTEST_STEP, _LONGEST_STEP = 0.0005, 0.005  # [s], of the physics
 _USUAL_STEP = 0.004  # of tasks with a URDF, which has none
 _FRICTION = (0.999, 0.999, 0.001, 0.5, 2)
 """Impedance of dry friction, as of `set_motors`: with MuJoCo's default a joint that friction holds creeps."""
+_STOP = (0.99, 0.999, 0.001, 0.5, 2)  # of the ends of the play, likewise
 _LEAST_MASS = 0.01  # of the heaviest link, of a link whose mass can be estimated
 
 Values = dict[str, Array]
@@ -35,7 +36,9 @@ class RobotModel:
     path: Path
     joints: tuple[str, ...]
     model: Any
-    """`mujoco.MjModel`: `nq`, `nv` and `nu` are the number of joints."""
+    """`mujoco.MjModel`: `nq`, `nv` and `nu` are the number of joints; with play a joint more for each."""
+    places: Array  # numbers of the joints in `qpos` and `qvel`
+    play_places: Array  # of the joints that are their play; none without play
     trees: Array  # number of the kinematic tree of each joint: joints of two trees do not move each other
     low: Array  # [rad or m], shape (joints,); -inf and inf without limits
     high: Array
@@ -79,11 +82,17 @@ def _compile(path: Path, spec: Any) -> Any:
 
 
 def read_robot(
-    file: str | Path, joints: Sequence[str] = (), *, timestep: float | None = None, collides: bool = False
+    file: str | Path,
+    joints: Sequence[str] = (),
+    *,
+    timestep: float | None = None,
+    collides: bool = False,
+    plays: bool = False,
 ) -> RobotModel:
     """Read a robot with a servo at each of `joints` (default: all that have one); the others are locked.
 
-    Its base is fixed where the file has it. The physics step is `timestep` [s], or the file's. Raises `TaskError` for a
+    Its base is fixed where the file has it. With `plays` the gears have play, whose size `backlash_rad` is, between the
+    servo with its encoder and the link. The physics step is `timestep` [s], or the file's. Raises `TaskError` for a
     file that cannot be read, `UsageError` for a joint that is not there.
     """
     path = find_model_file(file)
@@ -104,6 +113,9 @@ def read_robot(
     spec.option.timestep = float(np.clip(timestep or spec.option.timestep, _SHORTEST_STEP, _LONGEST_STEP))
     for name in kept:
         _add_servo(spec, name, servos[name], source)
+    if plays:
+        for name in kept:
+            _add_play(spec, name)
     model = _compile(path, spec)
     return _describe(path, model, kept, servos, source, notes)
 
@@ -159,6 +171,21 @@ def _add_servo(spec: Any, name: str, servo: tuple[float, float, float], source: 
     set_friction_impedance(joint, spec.option.timestep)
 
 
+def _add_play(spec: Any, name: str) -> None:
+    """Let a link move against its servo, as `set_motors` does: by a joint in series."""
+    joint = spec.joint(name)
+    joint.parent.add_joint(
+        name=f"play of {name}",
+        type=joint.type,
+        axis=joint.axis,
+        pos=joint.pos,
+        limited=int(import_mujoco().mjtLimited.mjLIMITED_TRUE),
+        range=[-1.0, 1.0],  # each world has its own
+        solref_limit=[2 * spec.option.timestep, 1.0],
+        solimp_limit=_STOP,
+    )
+
+
 def set_friction_impedance(joint: Any, timestep: float) -> None:
     """Let dry friction of a joint of an `MjSpec` hold it where it is, for a physics step of `timestep` [s]."""
     joint.solref_friction, joint.solimp_friction = [2 * timestep, 1.0], _FRICTION
@@ -172,17 +199,19 @@ def _describe(
     source: ModelFile,
     notes: Sequence[str],
 ) -> RobotModel:
-    limited = model.jnt_limited.astype(bool)
-    low, high = np.where(limited, model.jnt_range.T, [[-np.inf], [np.inf]])
+    places = np.array([int(model.joint(name).qposadr[0]) for name in kept])
+    limited = model.jnt_limited[places].astype(bool)
+    low, high = np.where(limited, model.jnt_range[places].T, [[-np.inf], [np.inf]])
     heavy = model.body_mass > _LEAST_MASS * model.body_mass.max()
     moving = [number for number in range(1, model.nbody) if model.body_weldid[number] and heavy[number]]
     nominal = {
         STIFFNESS: np.array([servos[name][0] for name in kept]),
         DAMPING: np.array([servos[name][1] for name in kept]),
-        ARMATURE: model.dof_armature.copy(),
-        VISCOUS: model.dof_damping.copy(),
-        COULOMB: model.dof_frictionloss.copy(),
-        BIAS: np.zeros(model.nv),
+        ARMATURE: model.dof_armature[places],
+        VISCOUS: model.dof_damping[places],
+        COULOMB: model.dof_frictionloss[places],
+        BIAS: np.zeros(len(kept)),
+        BACKLASH: np.zeros(len(kept)),
         DELAY: np.array(0.0),
         MASS: np.ones(model.nbody),
     }
@@ -190,14 +219,16 @@ def _describe(
         path=path,
         joints=tuple(kept),
         model=model,
-        trees=np.array(model.dof_treeid),
+        places=places,
+        play_places=np.setdiff1d(np.arange(model.nv), places),
+        trees=np.array(model.dof_treeid)[places],
         low=low,
         high=high,
         max_speed=np.array([source.max_speed.get(name, 0.0) for name in kept]),
         nominal=nominal,
         links=tuple(model.body(number).name for number in moving),
         link_numbers=tuple(moving),
-        is_turning=tuple(int(kind) == int(import_mujoco().mjtJoint.mjJNT_HINGE) for kind in model.jnt_type),
+        is_turning=tuple(int(kind) == int(import_mujoco().mjtJoint.mjJNT_HINGE) for kind in model.jnt_type[places]),
         notes=tuple(notes),
     )
 

@@ -14,6 +14,7 @@ from rlctl.task.mujoco.world import import_mujoco
 from rlctl_robot.identify.robot import RobotIdentification, RobotValue, describe
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
+    BACKLASH,
     BIAS,
     COULOMB,
     DAMPING,
@@ -31,11 +32,13 @@ _TITLES = {
     VISCOUS: "viscous\n[N m s/rad]",
     COULOMB: "Coulomb\n[N m]",
     BIAS: "bias\n[rad]",
+    BACKLASH: "backlash\n[rad]",
     MASS: "mass\n[factor]",
 }
 _EVENTS = (
     (COULOMB, "motor_friction", "coulomb_nm"),
     (BIAS, "motor_bias", "bias_rad"),
+    (BACKLASH, "backlash", "backlash_rad"),
     (DELAY, "motor_delay", "delay_s"),
 )
 """Quantities, the events that change them, and their parameters."""

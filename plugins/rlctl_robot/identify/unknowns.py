@@ -8,6 +8,7 @@ import numpy as np
 from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
+    BACKLASH,
     BIAS,
     COULOMB,
     DELAY,
@@ -26,11 +27,21 @@ QUANTITIES = {
     "coulomb": COULOMB,
     "bias": BIAS,
     "delay": DELAY,
+    "backlash": BACKLASH,
     "mass": MASS,
 }
 """What `--fit` can name."""
 DEFAULT = ("stiffness", "armature", "viscous", "coulomb", "bias", "delay")
-_LOWEST = {STIFFNESS: 1e-3, ARMATURE: 1e-6, VISCOUS: 0.0, COULOMB: 1e-6, BIAS: -np.pi, DELAY: 0.0, MASS: 0.05}
+_LOWEST = {
+    STIFFNESS: 1e-3,
+    ARMATURE: 1e-6,
+    VISCOUS: 0.0,
+    COULOMB: 1e-6,
+    BIAS: -np.pi,
+    BACKLASH: 1e-4,
+    DELAY: 0.0,
+    MASS: 0.05,
+}
 _STEP = 2e-3  # of a typical value, for derivatives
 _SURE = 3.0  # a first guess may be wrong by so many times a typical value
 
@@ -123,7 +134,7 @@ def list_unknowns(robot: RobotModel, start: Values, chosen: Collection[str], mov
 
 
 def _find_size(quantity: str, first: float) -> float:
-    sizes = {BIAS: 0.05, DELAY: 0.02, MASS: 1.0}
+    sizes = {BIAS: 0.05, BACKLASH: 0.02, DELAY: 0.02, MASS: 1.0}
     return sizes.get(quantity, max(abs(first), 1e-4))
 
 

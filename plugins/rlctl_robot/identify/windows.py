@@ -7,6 +7,7 @@ import numpy as np
 from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
+    BACKLASH,
     BIAS,
     COULOMB,
     DAMPING,
@@ -28,6 +29,8 @@ class WindowPlayer:
         """`commands` [rad or m], shape (rows, joints), are those of the log, in the frame of the encoders."""
         self.robot, self.control_dt = robot, control_dt
         self._commands, self._threads = commands, threads
+        self.sides = np.zeros_like(commands)
+        """Side of its play, -1 to 1, on which each link lies in each row: where a window begins."""
         self.substeps = max(1, int(np.ceil(control_dt / robot.model.opt.timestep - 1e-6)))
         self._batches: dict[int, Any] = {}
 
@@ -46,14 +49,17 @@ class WindowPlayer:
 
     def _play_batch(self, values: Values, first: Array, positions: Array, velocities: Array, steps: int) -> Array:
         batch, bias = self._prepare(values, len(first)), values[BIAS]
-        batch.bind("qpos")[:] = positions - bias
-        batch.bind("qvel")[:] = velocities
+        places, plays = self.robot.places, self.robot.play_places
+        batch.bind("qpos")[:, places] = positions - bias
+        batch.bind("qvel")[:, places] = velocities
+        if len(plays):
+            batch.bind("qpos")[:, plays] = values[BACKLASH] / 2 * self.sides[first]
         played = np.empty((len(first), steps + 1, positions.shape[1]))
         played[:, 0] = positions
         for step in range(steps):
             controls = self._find_commands(first + step, values[DELAY]) - bias[:, None]
             batch.rollout(self.substeps, controls, record=[])
-            played[:, step + 1] = batch.bind("qpos") + bias
+            played[:, step + 1] = batch.bind("qpos")[:, places] + bias
         return played
 
     def _prepare(self, values: Values, count: int) -> Any:
@@ -64,9 +70,13 @@ class WindowPlayer:
         if count not in self._batches:
             self._batches[count] = Batch(model, count, self._threads)
         batch = self._batches[count]
-        batch.expand("dof_armature")[:] = values[ARMATURE]
-        batch.expand("dof_damping")[:] = values[VISCOUS]
-        batch.expand("dof_frictionloss")[:] = values[COULOMB]
+        places, plays = self.robot.places, self.robot.play_places
+        batch.expand("dof_armature")[:, places] = values[ARMATURE]
+        batch.expand("dof_damping")[:, places] = values[VISCOUS]
+        batch.expand("dof_frictionloss")[:, places] = values[COULOMB]
+        if len(plays):
+            half = values[BACKLASH] / 2
+            batch.expand("jnt_range")[:, plays] = np.stack([-half, half], axis=-1)
         batch.expand("actuator_gainprm")[:, :, 0] = values[STIFFNESS]
         batch.expand("actuator_biasprm")[:, :, 1] = -values[STIFFNESS]
         batch.expand("actuator_biasprm")[:, :, 2] = -values[DAMPING]
