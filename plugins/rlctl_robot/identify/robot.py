@@ -42,6 +42,7 @@ _ENOUGH_OF_FEW = 20.0
 _LEAST_MOTION = 0.02  # [rad or m], of a joint that moves
 _LARGEST_ERROR = 0.5  # of the difference of target and position, that may stay unexplained in a joint
 _NOISE_RATIO = 3.0
+_FINEST = 1e-5  # [rad or m], of the noise of an encoder
 _STILL = 1e6  # armature and damping that hold a joint where it is
 _FIRST_BACKLASH = 0.01  # [rad or m]
 _MIN_KNOWN = {BIAS: 0.02, BACKLASH: 0.005, DELAY: 0.004}
@@ -296,7 +297,12 @@ def _describe_value(
     unknowns: UnknownValues, fit: WindowFit, index: int, robot: RobotModel, motion: Motion, bad: Collection[int]
 ) -> RobotValue:
     item, value = unknowns.items[index], float(fit.vector[index])
-    half = CONFIDENCE * float(np.sqrt(fit.covariance[index, index]))
+    # What the simulation does not explain is alike from row to row, and says less than as much noise would.
+    misfit = np.maximum(fit.noise / np.maximum(measure_noise(motion.positions), _FINEST), 1.0)
+    mine = unknowns.affected[:, index] & (np.ptp(motion.positions, axis=0) > _LEAST_MOTION)
+    if item.quantity in OF_JOINTS:
+        mine = np.arange(len(misfit)) == item.index
+    half = CONFIDENCE * float(np.sqrt(fit.covariance[index, index])) * float(np.median(misfit[mine]))
     low, high = max(value - half, item.lowest), value + half
     note = ""
     if item.part and item.quantity in OF_JOINTS and item.index in bad:

@@ -42,7 +42,7 @@ _LOWEST = {
     DELAY: 0.0,
     MASS: 0.05,
 }
-_STEP = 2e-3  # of a typical value, for derivatives
+_STEP, _PLAY_STEP = 2e-3, 0.05  # of a typical value, for derivatives; the ends of a play are not smooth
 _SURE = 3.0  # a first guess may be wrong by so many times a typical value
 
 
@@ -71,7 +71,8 @@ class Unknown:
     @property
     def step(self) -> float:
         """The change with which derivatives are computed."""
-        return _STEP * self.size
+        share = _PLAY_STEP if self.quantity == BACKLASH else _STEP
+        return share * self.size
 
     @property
     def doubt(self) -> float:
