@@ -85,11 +85,21 @@ class Regression:
             for commands in self._delayed
         ]
         best = int(np.argmin(scores))
+        found = np.array(
+            [
+                self._fit(joint, torques, self._delayed[best], fits_stiffness)[0]
+                for joint in range(len(self.robot.joints))
+            ]
+        )
+        stiffness = found[:, 0]
+        if np.isnan(stiffness).all():
+            inertia = 1.0 / np.maximum(self.robot.model.dof_invweight0, 1e-9)
+            stiffness = inertia / np.maximum(found[:, 1], 1e-4)
+        # A joint whose torques leave no trace has the usual motor of the robot.
+        stiffness = np.where(np.isnan(stiffness), np.nanmedian(stiffness), stiffness)
         values = {name: value.copy() for name, value in self.robot.nominal.items()}
-        values[DELAY] = np.array(_DELAYS[best])
-        for joint in range(len(self.robot.joints)):
-            found, _ = self._fit(joint, torques, self._delayed[best], fits_stiffness)
-            values[STIFFNESS][joint], values[ARMATURE][joint], values[VISCOUS][joint], values[COULOMB][joint] = found
+        values |= {STIFFNESS: stiffness, DELAY: np.array(_DELAYS[best])}
+        values[ARMATURE], values[VISCOUS], values[COULOMB] = stiffness * found[:, 1:].T
         values[VISCOUS] = np.maximum(values[VISCOUS] - values[DAMPING], 0.05 * values[VISCOUS])
         return values
 
@@ -138,7 +148,10 @@ class Regression:
     def _fit_one(
         self, moved: Derivatives, joint: int, torques: Array, commands: Array, fits_stiffness: bool
     ) -> tuple[Array, float]:
-        """Return stiffness, armature, viscous and Coulomb friction of a joint, and the unexplained share."""
+        """Return a joint's stiffness, and armature, viscous and Coulomb friction divided by it; the unexplained share.
+
+        The stiffness is NaN where torques explain so little that it is unknown.
+        """
         from scipy.optimize import nnls
 
         velocity = moved.velocities[:, joint]
@@ -155,16 +168,9 @@ class Regression:
         rest = difference - causes @ factors
         share = float(np.square(rest).mean() / max(np.square(difference).mean(), 1e-12))
         if not fits_stiffness:
-            return np.array([known, *(known * factors)]), share
-        stiffness = self._choose_stiffness(joint, factors, scaled[0] / max(np.sqrt(np.square(difference).mean()), 1e-9))
-        return np.array([stiffness, *(stiffness * factors[1:])]), share
-
-    def _choose_stiffness(self, joint: int, factors: Array, share: float) -> float:
-        """Return the stiffness; where torques explain little, that of the file, or one of a usual armature."""
-        known = self.robot.nominal[STIFFNESS][joint]
-        if share > _LEAST_SHARE and factors[0] > 0:
-            return float(1.0 / factors[0])
-        if not np.isnan(known):
-            return float(known)
-        inertia = 1.0 / max(float(self.robot.model.dof_invweight0[joint]), 1e-9)
-        return inertia / max(float(factors[1]), 1e-4)
+            return np.array([known, *factors]), share
+        explained = scaled[0] / max(float(np.sqrt(np.square(difference).mean())), 1e-9)
+        stiffness = known
+        if explained > _LEAST_SHARE and factors[0] > 0:
+            stiffness = 1.0 / factors[0]
+        return np.array([stiffness, *factors[1:]]), share

@@ -43,7 +43,10 @@ _LOWEST = {
     MASS: 0.05,
 }
 _STEP, _PLAY_STEP = 2e-3, 0.05  # of a typical value, for derivatives; the ends of a play are not smooth
-_SURE = 3.0  # a first guess may be wrong by so many times a typical value
+_SURE = 5.0  # a first guess may be wrong by so many times a typical value
+_SIZES = {BIAS: 0.05, BACKLASH: 0.02, DELAY: 0.02, MASS: 1.0}
+_SMALLEST = {ARMATURE: 2e-4, VISCOUS: 5e-3, COULOMB: 2e-3}
+"""Relative to the stiffness [s^2, s, rad]: smaller values than these hardly change how a servo moves."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,8 +120,12 @@ def list_unknowns(robot: RobotModel, start: Values, chosen: Collection[str], mov
 
     def add(quantity: str, index: int, part: str, place: int) -> None:
         first = float(np.ravel(start[quantity])[index])
+        size = _SIZES.get(quantity) or abs(first)
+        if quantity in _SMALLEST:
+            size = max(size, _SMALLEST[quantity] * start[STIFFNESS][index])
+            first = max(first, _SMALLEST[quantity] * start[STIFFNESS][index])
         group = keys.setdefault((quantity, place), len(keys))
-        items.append(Unknown(quantity, index, part, _find_size(quantity, first), first, group))
+        items.append(Unknown(quantity, index, part, size, first, group))
 
     for short in (name for name in QUANTITIES if name in chosen):
         quantity = QUANTITIES[short]
@@ -132,11 +139,6 @@ def list_unknowns(robot: RobotModel, start: Values, chosen: Collection[str], mov
                 add(quantity, joint, robot.joints[joint], order[joint])
     affected = np.stack([_find_affected(robot, item) for item in items], axis=1)
     return UnknownValues(tuple(items), start, affected)
-
-
-def _find_size(quantity: str, first: float) -> float:
-    sizes = {BIAS: 0.05, BACKLASH: 0.02, DELAY: 0.02, MASS: 1.0}
-    return sizes.get(quantity, max(abs(first), 1e-4))
 
 
 def _find_affected(robot: RobotModel, item: Unknown) -> Array:
