@@ -32,7 +32,7 @@ def identify(
         list[str],
         Option(
             "Of a model file: estimate this quantity only (stiffness, armature, viscous, coulomb, bias, delay, "
-            "backlash, mass); repeatable. Default: all but the last two.",
+            "torque, backlash, mass); repeatable. Default: all but the last three.",
             ("--fit",),
             metavar="NAME",
         ),

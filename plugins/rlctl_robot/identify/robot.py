@@ -22,6 +22,7 @@ from rlctl_robot.identify.robot_model import (
     DELAY,
     OF_JOINTS,
     STIFFNESS,
+    TORQUE,
     VISCOUS,
     RobotModel,
     Values,
@@ -42,9 +43,12 @@ _ENOUGH_OF_FEW = 20.0
 _LEAST_MOTION = 0.02  # [rad or m], of a joint that moves
 _LARGEST_ERROR = 0.5  # of the difference of target and position, that may stay unexplained in a joint
 _NOISE_RATIO = 3.0
+_MOST_NOTES = 2
 _FINEST = 1e-5  # [rad or m], of the noise of an encoder
+_MOST_MISFIT = 3.0
 _STILL = 1e6  # armature and damping that hold a joint where it is
 _FIRST_BACKLASH = 0.01  # [rad or m]
+_FIRST_TORQUE = 0.8  # of the torque that a servo without a limit would have had in the log
 _MIN_KNOWN = {BIAS: 0.02, BACKLASH: 0.005, DELAY: 0.004}
 """Half widths of intervals [rad, s] at which values that may be 0 count as known."""
 _SMALL_FRICTION = 0.02  # of the torques of a joint: a friction known as well as this is known, even if it is 0
@@ -126,6 +130,8 @@ def identify_robot(
     regression = Regression(robot, motion, np.flatnonzero(~is_held_out))
     check_model(regression, motion, moving)
     guess = regression.guess("stiffness" in chosen) | {BACKLASH: np.full(len(robot.joints), _FIRST_BACKLASH)}
+    largest = guess[STIFFNESS] * np.abs(motion.commands - motion.positions).max(axis=0)
+    guess[TORQUE] = np.minimum(robot.nominal[TORQUE], _FIRST_TORQUE * largest)
     start = robot.nominal | {QUANTITIES[name]: guess[QUANTITIES[name]] for name in chosen}
     start = _hold_still(start, motion, moving)
     unknowns = list_unknowns(robot, start, chosen, moving)
@@ -147,10 +153,14 @@ def identify_robot(
         )
     values = [_describe_value(unknowns, found, index, robot, motion, bad) for index in range(len(unknowns.items))]
     values += _list_still(robot, chosen, moving)
-    if not any(value.known for value in values):
-        notes = "; ".join(dict.fromkeys(value.note for value in values))
-        raise AnswerIsNo(f"{log}: this log determines none of the values: {notes}")
     total = np.sqrt(np.square(by_joint[:, moving]).mean(axis=1))
+    if not any(value.known for value in values):
+        notes = list(dict.fromkeys(value.note for value in values))
+        more = f", and {len(notes) - _MOST_NOTES} more notes" if len(notes) > _MOST_NOTES else ""
+        raise AnswerIsNo(
+            f"{log}: this log determines none of the values: {'; '.join(notes[:_MOST_NOTES])}{more}\n"
+            f"error held out: {total[0]:.3g} rad with the file's values, {total[1]:.3g} rad with the best"
+        )
     return RobotIdentification(
         robot=path,
         log=log,
@@ -298,7 +308,7 @@ def _describe_value(
 ) -> RobotValue:
     item, value = unknowns.items[index], float(fit.vector[index])
     # What the simulation does not explain is alike from row to row, and says less than as much noise would.
-    misfit = np.maximum(fit.noise / np.maximum(measure_noise(motion.positions), _FINEST), 1.0)
+    misfit = np.clip(fit.noise / np.maximum(measure_noise(motion.positions), _FINEST), 1.0, _MOST_MISFIT)
     mine = unknowns.affected[:, index] & (np.ptp(motion.positions, axis=0) > _LEAST_MOTION)
     if item.quantity in OF_JOINTS:
         mine = np.arange(len(misfit)) == item.index

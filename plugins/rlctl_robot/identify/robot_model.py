@@ -16,9 +16,11 @@ from rlctl_robot.identify.log import Array
 STIFFNESS, DAMPING = "stiffness_nm_per_rad", "damping_nms_per_rad"
 ARMATURE, COULOMB, VISCOUS = "armature_kgm2", "coulomb_friction_nm", "viscous_friction_nms_per_rad"
 BIAS, BACKLASH, DELAY, MASS = "encoder_bias_rad", "backlash_rad", "delay_s", "mass_factor"
-OF_JOINTS = (STIFFNESS, ARMATURE, VISCOUS, COULOMB, BIAS, BACKLASH)
+TORQUE = "max_torque_nm"
+OF_JOINTS = (STIFFNESS, ARMATURE, VISCOUS, COULOMB, BIAS, TORQUE, BACKLASH)
 """Values of each joint, with the names of `rlctl.task.motors.Motor`."""
 _SHORTEST_STEP, _LONGEST_STEP = 0.0005, 0.005  # [s], of the physics
+UNLIMITED = 1e9  # [N m or N]
 _USUAL_STEP = 0.004  # of tasks with a URDF, which has none
 _FRICTION = (0.999, 0.999, 0.001, 0.5, 2)
 """Impedance of dry friction, as of `set_motors`: with MuJoCo's default a joint that friction holds creeps."""
@@ -48,12 +50,6 @@ class RobotModel:
     link_numbers: tuple[int, ...]  # their numbers in the model
     is_turning: tuple[bool, ...]  # whether a joint is a hinge
     notes: tuple[str, ...] = ()
-
-    @property
-    def max_force(self) -> Array:
-        """Largest torque of each servo [N m or N], inf without a limit."""
-        limited = self.model.actuator_forcelimited.astype(bool)
-        return np.where(limited, self.model.actuator_forcerange[:, 1], np.inf)
 
 
 def is_model_file(name: str) -> bool:
@@ -163,8 +159,8 @@ def _add_servo(spec: Any, name: str, servo: tuple[float, float, float], source: 
     motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
     gain = 1.0 if np.isnan(stiffness) else stiffness
     motor.gainprm[0], motor.biasprm[1], motor.biasprm[2] = gain, -gain, -damping
-    if force > 0:
-        motor.forcelimited, motor.forcerange = True, [-force, force]
+    force = force or UNLIMITED
+    motor.forcelimited, motor.forcerange = True, [-force, force]
     # Where a value is 0, MuJoCo leaves out what belongs to it, and worlds of a batch could not change it.
     joint.frictionloss = max(joint.frictionloss, 1e-6)
     joint.armature = max(joint.armature, 1e-6)
@@ -211,6 +207,7 @@ def _describe(
         VISCOUS: model.dof_damping[places],
         COULOMB: model.dof_frictionloss[places],
         BIAS: np.zeros(len(kept)),
+        TORQUE: model.actuator_forcerange[:, 1].copy(),
         BACKLASH: np.zeros(len(kept)),
         DELAY: np.array(0.0),
         MASS: np.ones(model.nbody),

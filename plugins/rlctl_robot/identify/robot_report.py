@@ -22,18 +22,20 @@ from rlctl_robot.identify.robot_model import (
     MASS,
     OF_JOINTS,
     STIFFNESS,
+    TORQUE,
     VISCOUS,
     set_friction_impedance,
 )
 
 _TITLES = {
-    STIFFNESS: "stiffness\n[N m/rad]",
-    ARMATURE: "armature\n[kg m^2]",
-    VISCOUS: "viscous\n[N m s/rad]",
-    COULOMB: "Coulomb\n[N m]",
-    BIAS: "bias\n[rad]",
-    BACKLASH: "backlash\n[rad]",
-    MASS: "mass\n[factor]",
+    STIFFNESS: "stiffness [N m/rad]",
+    ARMATURE: "armature [kg m^2]",
+    VISCOUS: "viscous [N m s/rad]",
+    COULOMB: "Coulomb [N m]",
+    BIAS: "bias [rad]",
+    TORQUE: "largest torque [N m]",
+    BACKLASH: "backlash [rad]",
+    MASS: "mass [factor]",
 }
 _EVENTS = (
     (COULOMB, "motor_friction", "coulomb_nm"),
@@ -166,6 +168,9 @@ def make_mjcf(result: RobotIdentification) -> str:
         joint.damping = [motor[VISCOUS], 0.0, 0.0]
         set_friction_impedance(joint, spec.option.timestep)
         _set_servo(spec, name, motor)
+        if TORQUE in motor:
+            spec.joint(name).actfrcrange = [-motor[TORQUE], motor[TORQUE]]
+            spec.joint(name).actfrclimited = True
     for value in result.values:
         if value.quantity == MASS and value.known:
             body = spec.body(value.part)

@@ -14,6 +14,7 @@ from rlctl_robot.identify.robot_model import (
     DELAY,
     MASS,
     STIFFNESS,
+    TORQUE,
     VISCOUS,
     RobotModel,
     Values,
@@ -27,6 +28,7 @@ QUANTITIES = {
     "coulomb": COULOMB,
     "bias": BIAS,
     "delay": DELAY,
+    "torque": TORQUE,
     "backlash": BACKLASH,
     "mass": MASS,
 }
@@ -38,6 +40,7 @@ _LOWEST = {
     VISCOUS: 0.0,
     COULOMB: 1e-6,
     BIAS: -np.pi,
+    TORQUE: 1e-3,
     BACKLASH: 1e-4,
     DELAY: 0.0,
     MASS: 0.05,

@@ -14,6 +14,7 @@ from rlctl_robot.identify.robot_model import (
     DELAY,
     MASS,
     STIFFNESS,
+    TORQUE,
     VISCOUS,
     RobotModel,
     Values,
@@ -74,6 +75,7 @@ class WindowPlayer:
         batch.expand("dof_armature")[:, places] = values[ARMATURE]
         batch.expand("dof_damping")[:, places] = values[VISCOUS]
         batch.expand("dof_frictionloss")[:, places] = values[COULOMB]
+        batch.expand("actuator_forcerange")[:] = values[TORQUE][..., None] * [-1.0, 1.0]
         if len(plays):
             half = values[BACKLASH] / 2
             batch.expand("jnt_range")[:, plays] = np.stack([-half, half], axis=-1)
