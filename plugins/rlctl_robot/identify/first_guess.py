@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.task.mujoco.world import import_mujoco
 from rlctl_robot.identify.log import Array
@@ -24,6 +25,8 @@ from rlctl_robot.identify.robot_model import (
     RobotModel,
     Values,
 )
+
+Rows = NDArray[np.int64]
 
 _SMOOTHING_S = 0.12  # of positions, for velocities and accelerations
 _SLOW = 0.05  # [rad/s or m/s], below which the sign of a velocity is uncertain
@@ -62,7 +65,7 @@ def differentiate(motion: Motion) -> Derivatives:
 class Regression:
     """Explains a log's differences of targets and positions by torques and friction, joint by joint."""
 
-    def __init__(self, robot: RobotModel, motion: Motion, rows: Array) -> None:
+    def __init__(self, robot: RobotModel, motion: Motion, rows: Rows) -> None:
         """`rows` are those that may be used."""
         self.robot, self.motion = robot, motion
         derivatives = differentiate(motion)

@@ -16,7 +16,7 @@ def explain_unknown(names: Sequence[str], index: int, information: Array) -> str
     sizes, directions = np.linalg.eigh(information)
     shares = np.abs(directions[index]) / np.sqrt(np.maximum(sizes, 1e-12 * sizes[-1]))
     direction = directions[:, int(shares.argmax())]
-    large = np.flatnonzero(np.abs(direction) >= _MIN_COMPONENT)
+    large = np.flatnonzero(np.abs(direction) >= _MIN_COMPONENT).tolist()
     others = [names[other] for other in large if other != index] or ["the others"]
     return f"this log cannot tell {names[index]} from {' and '.join(others)}"
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, UsageError, check_name
 from rlctl.task.model_files import find_model_file
@@ -33,6 +34,8 @@ from rlctl_robot.identify.robot_model import (
 from rlctl_robot.identify.unknowns import DEFAULT, QUANTITIES, Unknown, UnknownValues, list_unknowns
 from rlctl_robot.identify.window_fit import ENOUGH, WindowFit, WindowFitter
 from rlctl_robot.identify.windows import WindowPlayer
+
+Flags = NDArray[np.bool_]
 
 _WINDOW_S = 1.0
 _PARTS = 5  # of a log; the end of each is held out
@@ -87,7 +90,7 @@ class RobotIdentification:
     fitted: Values = dataclasses.field(repr=False, default_factory=dict)
     """All values of the robot, those that are not known too, in the order of its joints."""
     joints: tuple[str, ...] = ()
-    is_held_out: Array = dataclasses.field(repr=False, default_factory=lambda: np.zeros(0, bool))
+    is_held_out: Flags = dataclasses.field(repr=False, default_factory=lambda: np.zeros(0, bool))
     """Rows to which no value was fitted, shape (rows,)."""
 
     def find(self, part: str, quantity: str) -> RobotValue | None:
@@ -227,17 +230,17 @@ def _find_moving(motion: Motion) -> list[int]:
     return np.flatnonzero(np.ptp(motion.positions, axis=0) > _LEAST_MOTION).tolist()
 
 
-def _hold_out(motion: Motion) -> Array:
+def _hold_out(motion: Motion) -> Flags:
     """Return which rows no value is fitted to: the end of each fifth of the log, (rows,)."""
     edges = np.linspace(0, len(motion.positions), _PARTS + 1)
     position = np.arange(len(motion.positions))
     part = np.clip(np.searchsorted(edges, position, side="right") - 1, 0, _PARTS - 1)
     share = (position - edges[part]) / np.diff(edges)[part]
-    held_out: Array = share >= 1 - _HELD_OUT
+    held_out: Flags = share >= 1 - _HELD_OUT
     return held_out
 
 
-def _choose_windows(motion: Motion, is_held_out: Array) -> tuple[Array, int]:
+def _choose_windows(motion: Motion, is_held_out: Flags) -> tuple[Array, int]:
     """Return the first rows of the windows, and their control steps; raises `AnswerIsNo` if there are too few."""
     steps = max(4, round(_WINDOW_S / motion.control_dt))
     starts: list[int] = []
@@ -286,14 +289,14 @@ def play_through(player: WindowPlayer, motion: Motion, candidates: list[Values])
     count = len(candidates)
     parts = []
     for begin, length in zip(motion.starts, motion.lengths, strict=True):
-        state = (np.repeat(rows[begin][None], count, axis=0) for rows in (motion.positions, velocities))
-        played = player.play(values, np.full(count, begin), *state, length - 1)
+        first, speed = (np.repeat(rows[begin][None], count, axis=0) for rows in (motion.positions, velocities))
+        played = player.play(values, np.full(count, begin), first, speed, length - 1)
         parts.append(played - motion.positions[begin : begin + length])
     return np.concatenate(parts, axis=1)
 
 
 def _find_unexplained(
-    motion: Motion, errors: Array, is_held_out: Array, moving: Collection[int], after: Values
+    motion: Motion, errors: Array, is_held_out: Flags, moving: Collection[int], after: Values
 ) -> list[int]:
     """Return the joints that the simulation does not follow with the best values."""
     late = round(float(after[DELAY]) / motion.control_dt)

@@ -93,7 +93,7 @@ def draw_targets(robot: RobotModel, seconds: float, control_dt: float, amplitude
     rng = np.random.default_rng(seed)
     joints, count = len(robot.joints), round(seconds / control_dt)
     pose, room = _choose_pose(robot)
-    time = np.arange(count) * control_dt
+    time: Array = np.arange(count) * np.float64(control_dt)
     targets = np.repeat(pose[None], count, axis=0)
     alone = _ALONE * seconds / joints
     for joint in range(joints):
