@@ -83,8 +83,9 @@ class Regression:
     def guess(self, fits_stiffness: bool) -> Values:
         """Return the values that explain the log best."""
         torques = self._compute_torques(self._derivatives)
+        sizes = _measure_differences(self._derivatives, self._delayed[0])
         scores = [
-            sum(self._fit(joint, torques, commands, fits_stiffness)[1] for joint in range(len(self.robot.joints)))
+            sum(self._fit(joint, torques, commands, fits_stiffness)[1] / size for joint, size in enumerate(sizes))
             for commands in self._delayed
         ]
         best = int(np.argmin(scores))
@@ -112,10 +113,11 @@ class Regression:
         fields = [getattr(self._derivatives, field.name) for field in dataclasses.fields(Derivatives)]
         changed = Derivatives(*(values[few][:, order] * signs for values in fields))
         torques = self._compute_torques(changed)
-        joints = range(len(self.robot.joints))
+        delayed = [commands[few][:, order] * signs for commands in self._delayed[::_COMPARED_DELAYS]]
+        sizes = _measure_differences(changed, delayed[0])
         shares = [
-            [self._fit_one(changed, joint, torques, commands[few][:, order] * signs, True)[1] for joint in joints]
-            for commands in self._delayed[::_COMPARED_DELAYS]
+            [self._fit_one(changed, joint, torques, commands, True)[1] / size for joint, size in enumerate(sizes)]
+            for commands in delayed
         ]
         best = int(np.argmin(np.sum(shares, axis=1)))
         return np.array(shares[best])
@@ -151,7 +153,7 @@ class Regression:
     def _fit_one(
         self, moved: Derivatives, joint: int, torques: Array, commands: Array, fits_stiffness: bool
     ) -> tuple[Array, float]:
-        """Return a joint's stiffness, and armature, viscous and Coulomb friction divided by it; the unexplained share.
+        """Return a joint's stiffness, and armature, viscous and Coulomb friction divided by it; the mean square error.
 
         The stiffness is NaN where torques explain so little that it is unknown.
         """
@@ -169,11 +171,17 @@ class Regression:
         scaled, _ = nnls(causes / sizes, difference)
         factors = scaled / sizes
         rest = difference - causes @ factors
-        share = float(np.square(rest).mean() / max(np.square(difference).mean(), 1e-12))
+        error = float(np.square(rest).mean())
         if not fits_stiffness:
-            return np.array([known, *factors]), share
+            return np.array([known, *factors]), error
         explained = scaled[0] / max(float(np.sqrt(np.square(difference).mean())), 1e-9)
         stiffness = known
         if explained > _LEAST_SHARE and factors[0] > 0:
             stiffness = 1.0 / factors[0]
-        return np.array([stiffness, *factors[1:]]), share
+        return np.array([stiffness, *factors[1:]]), error
+
+
+def _measure_differences(moved: Derivatives, commands: Array) -> list[float]:
+    """Return the mean square of each joint's difference of commands and positions."""
+    squares = np.square(commands - moved.positions).mean(axis=0)
+    return np.maximum(squares, 1e-12).tolist()

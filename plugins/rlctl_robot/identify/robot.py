@@ -147,7 +147,7 @@ def identify_robot(
     report("held-out rows")
     errors = play_through(player, motion, [before, after])[:, is_held_out]
     by_joint = np.sqrt(np.square(errors).mean(axis=1))
-    bad = _find_unexplained(motion, by_joint[1], is_held_out, moving, after)
+    bad = _find_unexplained(motion, by_joint, is_held_out, moving, after)
     if len(bad) == len(moving):
         raise AnswerIsNo(
             f"{log}: {path.name} does not explain this log: the simulated positions of every joint are wrong by more "
@@ -298,12 +298,14 @@ def play_through(player: WindowPlayer, motion: Motion, candidates: list[Values])
 def _find_unexplained(
     motion: Motion, errors: Array, is_held_out: Flags, moving: Collection[int], after: Values
 ) -> list[int]:
-    """Return the joints that the simulation does not follow with the best values."""
+    """Return the joints that the simulation does not follow with the best values, or less well than with the file's."""
     late = round(float(after[DELAY]) / motion.control_dt)
     commands = np.roll(motion.commands, late, axis=0)
     differences = np.std((commands - motion.positions)[is_held_out], axis=0)
-    allowed = np.maximum(_LARGEST_ERROR * differences, _NOISE_RATIO * measure_noise(motion.positions))
-    return [joint for joint in moving if not errors[joint] <= allowed[joint]]
+    noise = _NOISE_RATIO * measure_noise(motion.positions)
+    allowed = np.maximum(_LARGEST_ERROR * differences, noise)
+    is_worse = errors[1] > np.maximum(errors[0], noise)
+    return [joint for joint in moving if is_worse[joint] or not errors[1, joint] <= allowed[joint]]
 
 
 def _describe_value(

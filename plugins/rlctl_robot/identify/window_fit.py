@@ -190,7 +190,7 @@ class WindowFitter:
     def _reduce(self, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
         """Eliminate the start states: return the matrix and gradients (windows, unknowns) of the values alone."""
         size = equations.states.shape[-1]
-        inverse: Array = np.linalg.inv(equations.states * (1.0 + damping * np.eye(size)))
+        inverse = np.asarray(np.linalg.inv(equations.states * (1.0 + damping * np.eye(size))), np.float64)
         influence = equations.mixed @ inverse
         matrix = equations.values - np.einsum("wps,wqs->pq", influence, equations.mixed, optimize=True)
         gradients = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
