@@ -72,13 +72,21 @@ def show_robot(result: RobotIdentification, written: list[Path], json: str | Non
         f"error of positions in {result.held_out_seconds:.1f} s held out of the fit: {result.error_before:.3g} rad "
         f"with the file's values, {result.error_after:.3g} rad with these (m if sliding)"
     )
-    notes = dict.fromkeys(f"{value.name}: {value.note}" for value in result.values if value.note)
-    for note in notes:
+    for note in _list_notes(result):
         out.print(note)
     if written:
         out.print(f"written: {', '.join(str(path) for path in written)}")
     else:
         out.print("\nto write them as a model file and for set_motors: -o FOLDER")
+
+
+def _list_notes(result: RobotIdentification) -> list[str]:
+    """Return why values are not known, a line for all values of a joint with the same reason."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for value in result.values:
+        if value.note:
+            reasons.setdefault((value.part, value.note), []).append(value.quantity)
+    return [f"{part} {', '.join(names)}: {note}".strip() for (part, note), names in reasons.items()]
 
 
 def _format(value: RobotValue | None) -> str:
