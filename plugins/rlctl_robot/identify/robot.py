@@ -1,6 +1,7 @@
 """Estimates the values of a robot's servos from a log of commands and encoders; needs no task."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ _WINDOW_S = 1.0
 _PARTS = 5  # of a log; the end of each is held out
 _HELD_OUT = 0.2  # of each part
 _LEAST_WINDOWS = 4
+_MOST_FITTED_ROWS = 15_000
 _FEW = 3  # one in so many windows, to which the values are fitted first
 _ENOUGH_OF_FEW = 20.0
 _LEAST_MOTION = 0.02  # [rad or m], of a joint that moves
@@ -258,7 +260,8 @@ def _choose_windows(motion: Motion, is_held_out: Flags) -> tuple[Array, int]:
             f"{motion.table.path}: {len(starts)} parts of {_WINDOW_S:g} s without a gap, at least {_LEAST_WINDOWS} are "
             "needed: record a minute"
         )
-    return np.array(starts), steps
+    every = max(1, math.ceil(len(starts) * steps / _MOST_FITTED_ROWS))  # memory is proportional to rows
+    return np.array(starts[::every]), steps
 
 
 def _hold_still(values: Values, motion: Motion, moving: Collection[int]) -> Values:
