@@ -1,12 +1,14 @@
 """`rlctl identify`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from rlctl.arguments import command, parse_changes
-from rlctl.engine import Engine
 from rlctl.errors import UsageError
 from rlctl.options import TASK_FORMS, Argument, Json, Option, Settings, SimOption
+
+if TYPE_CHECKING:
+    from rlctl.environments.spec import EnvSpec
 
 
 @command
@@ -85,7 +87,10 @@ def identify(
             {"--fit": fit, "--columns": columns, "--timestep": timestep, "--output": output},
             "a robot's model file (.xml, .urdf)",
         )
-        _identify_task(task, log, excite, events, seconds or 10.0, settings, sim, seed, json)
+        from rlctl.recipe.sources import make_spec
+
+        spec = parse_changes(settings, sim).apply(make_spec(task))
+        _identify_task(spec, log, excite, events, seconds or 10.0, seed, json)
         return
     _refuse({"--event": events, "--set": settings, "--sim": sim}, "a task")
     if excite is not None:
@@ -133,22 +138,18 @@ def _identify_robot(
 
 
 def _identify_task(
-    task: str,
+    spec: "EnvSpec",
     log: Path | None,
     excite: Path | None,
     events: list[str],
     seconds: float,
-    settings: list[str],
-    sim: Engine | None,
     seed: int,
     json: str | None,
 ) -> None:
     from rlctl import output
-    from rlctl.recipe.sources import make_spec
     from rlctl_robot.identify.excite import show_excitation, write_excitation
     from rlctl_robot.identify.identify import identify, show
 
-    spec = parse_changes(settings, sim).apply(make_spec(task))
     if excite is not None:
         show_excitation(write_excitation(spec, excite, seconds=seconds, seed=seed), json)
         return
