@@ -20,6 +20,7 @@ _NEAR = 0.2  # relative decrease of the cost, below which derivatives hold for t
 _DAMPINGS = (0.01, 0.1, 1.0, 10.0, 1000.0)  # factors of the last damping, tried in one batch
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-9, 1e6
 _LINEAR = 3.0  # standard deviations, beyond which an error counts linearly (Huber)
+_QUANTILE, _AT_QUANTILE = 0.9, 1.645  # of errors, and of a normal distribution
 _POSITION_STEP, _VELOCITY_STEP = 2e-4, 2e-3  # [rad or m], [rad/s or m/s], for derivatives
 _FINEST = 1e-5  # [rad or m], of a measurement
 _TIE = 1e-6  # weight with which a start state stays where it is, relative to what its window says
@@ -129,8 +130,8 @@ class WindowFitter:
 
     def _estimate_noise(self, errors: Array) -> Array:
         """Return the standard deviation of each joint's errors, on which outliers have little influence."""
-        middle = 1.4826 * np.median(np.abs(errors), axis=(0, 1))
-        middle = np.maximum(middle, _FINEST)
+        # Not the median: a joint that rests for most of the time must not make its motion an outlier.
+        middle = np.maximum(np.quantile(np.abs(errors), _QUANTILE, axis=(0, 1)) / _AT_QUANTILE, _FINEST)
         clipped = np.clip(errors, -_LINEAR * middle, _LINEAR * middle)
         noise: Array = np.maximum(np.sqrt(np.square(clipped).mean(axis=(0, 1))), _FINEST)
         return noise
