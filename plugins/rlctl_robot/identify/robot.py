@@ -134,12 +134,8 @@ def identify_robot(
     is_held_out = _hold_out(motion)
     regression = Regression(robot, motion, np.flatnonzero(~is_held_out))
     check_model(regression, motion, moving)
-    guess = regression.guess("stiffness" in chosen) | {BACKLASH: np.full(len(robot.joints), _FIRST_BACKLASH)}
-    largest = guess[STIFFNESS] * np.abs(motion.commands - motion.positions).max(axis=0)
-    guess[TORQUE] = np.minimum(robot.nominal[TORQUE], _FIRST_TORQUE * largest)
-    start = robot.nominal | {QUANTITIES[name]: guess[QUANTITIES[name]] for name in chosen}
-    start = _hold_still(start, motion, moving)
-    unknowns = list_unknowns(robot, start, chosen, moving)
+    start = _guess_start(robot, motion, regression, chosen)
+    unknowns = list_unknowns(robot, _hold_still(start, motion, moving), chosen, moving)
     player = _make_player(robot, motion, regression, chosen, threads)
     starts, steps = _choose_windows(motion, is_held_out)
     report(f"{len(unknowns.items)} values, {len(starts)} windows of {steps * motion.control_dt:.2g} s")
@@ -152,8 +148,9 @@ def identify_robot(
     bad = _find_unexplained(motion, by_joint, is_held_out, moving, after)
     if len(bad) == len(moving):
         raise AnswerIsNo(
-            f"{log}: {path.name} does not explain this log: the simulated positions of every joint are wrong by more "
-            f"than {_LARGEST_ERROR:.0%} of the servo's error, with the best values: no values\n"
+            f"{log}: {path.name} does not explain this log: with the best values the simulated positions of every "
+            f"joint are wrong by more than {_LARGEST_ERROR:.0%} of its servo's error, or by more than with the file's: "
+            "no values\n"
             "compare the file's axes, masses and gravity with the robot, and what else moves or holds it"
         )
     values = [_describe_value(unknowns, found, index, robot, motion, bad) for index in range(len(unknowns.items))]
@@ -182,6 +179,15 @@ def identify_robot(
         joints=robot.joints,
         is_held_out=is_held_out,
     )
+
+
+def _guess_start(robot: RobotModel, motion: Motion, regression: Regression, chosen: Collection[str]) -> Values:
+    """Return a first guess of the chosen quantities, and the file's values of the others."""
+    guess = regression.guess("stiffness" in chosen)
+    guess[BACKLASH] = np.full(len(robot.joints), _FIRST_BACKLASH)
+    largest = guess[STIFFNESS] * np.abs(motion.commands - motion.positions).max(axis=0)
+    guess[TORQUE] = np.minimum(robot.nominal[TORQUE], _FIRST_TORQUE * largest)
+    return robot.nominal | {QUANTITIES[name]: guess[QUANTITIES[name]] for name in chosen}
 
 
 def _make_player(
@@ -366,8 +372,10 @@ def _list_still(robot: RobotModel, chosen: Collection[str], moving: Collection[i
 
 
 def describe(result: RobotIdentification) -> dict[str, Any]:
-    """Return a result as plain data, for JSON."""
+    """Return a result as plain data, for JSON; numbers that are not known at all are None."""
     described = dataclasses.asdict(result)
     for name in ("fitted", "joints", "is_held_out"):
         del described[name]
+    for value in described["values"]:
+        value |= {name: None for name in ("value", "low", "high") if not math.isfinite(value[name])}
     return described

@@ -13,7 +13,7 @@ from rlctl.storage import yaml_text
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression
 from rlctl_robot.identify.motion import check_positions, read_motion, write_motion
-from rlctl_robot.identify.robot import identify_robot
+from rlctl_robot.identify.robot import describe, identify_robot
 from rlctl_robot.identify.robot_excite import draw_targets, write_robot_excitation
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
@@ -149,6 +149,7 @@ def test_a_joint_that_does_not_move_is_named(recorded, write):
     elbow = found.find("elbow", STIFFNESS)
     assert not elbow.known
     assert elbow.note == "elbow does not move in this log"
+    assert describe(found)["values"][-1]["value"] is None
     assert "elbow" not in make_motors(found)
     assert "elbow" not in make_ranges(found)
     with pytest.raises(AnswerIsNo, match="no joint moves by more than"):
