@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rlctl.task.model_files import MODELS
-from rlctl_robot.identify.motion import Motion, read_motion, write_motion
+from rlctl_robot.identify.motion import ServoLog, read_motion, write_motion
 from rlctl_robot.identify.robot import RobotIdentification, identify_robot, play_through
 from rlctl_robot.identify.robot_excite import draw_targets
 from rlctl_robot.identify.robot_model import (
@@ -103,7 +103,7 @@ def run_trial(kind: str, seed: int) -> Trial:
 
 
 def _judge(
-    found: RobotIdentification, robot: RobotModel, true: Values, motion: Motion, seconds: float, busy: float
+    found: RobotIdentification, robot: RobotModel, true: Values, motion: ServoLog, seconds: float, busy: float
 ) -> Trial:
     errors, inside, unknown = [], [], 0
     for value in found.values:

@@ -10,7 +10,7 @@ import numpy as np
 from rlctl.errors import AnswerIsNo
 from rlctl_robot.identify.first_guess import Regression
 from rlctl_robot.identify.log import Array
-from rlctl_robot.identify.motion import Motion
+from rlctl_robot.identify.motion import ServoLog
 
 _LATEST_S = 0.2  # by which a position may follow its command late
 _WEAK, _CLEAR = 0.5, 0.8  # correlations of a position with its own command, and with that of another joint
@@ -21,7 +21,7 @@ _MOST_CHANGED = 2
 _LEAST_SHARE = 1e-4
 
 
-def check_commands(motion: Motion, moving: Sequence[int]) -> None:
+def check_commands(motion: ServoLog, moving: Sequence[int]) -> None:
     """Raise `AnswerIsNo` if positions follow the commands of other joints, or with another sign or unit."""
     correlations = _correlate(motion)
     for joint in moving:
@@ -42,7 +42,7 @@ def check_commands(motion: Motion, moving: Sequence[int]) -> None:
             _check_unit(motion, joint)
 
 
-def _check_unit(motion: Motion, joint: int) -> None:
+def _check_unit(motion: ServoLog, joint: int) -> None:
     """Raise `AnswerIsNo` if a command and its position differ by the factor of degrees."""
     factor = float(motion.positions[:, joint].std() / max(motion.commands[:, joint].std(), 1e-12))
     position, command = motion.columns[joint], motion.command_columns[joint]
@@ -54,7 +54,7 @@ def _check_unit(motion: Motion, joint: int) -> None:
             )
 
 
-def _correlate(motion: Motion) -> Array:
+def _correlate(motion: ServoLog) -> Array:
     """Return the correlation of each position with each command, at the delay where it is largest, (joints,) * 2."""
     positions, commands = _standardise(motion.positions), _standardise(motion.commands)
     steps = max(1, round(_LATEST_S / motion.control_dt))
@@ -73,7 +73,7 @@ def _standardise(values: Array) -> Array:
     return scaled
 
 
-def check_model(regression: Regression, motion: Motion, moving: Sequence[int]) -> None:
+def check_model(regression: Regression, motion: ServoLog, moving: Sequence[int]) -> None:
     """Raise `AnswerIsNo` if gravity and inertia fit far better when joints of the log have another sign or order."""
     robot = regression.robot
     count = len(robot.joints)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rlctl.task.mujoco.world import import_mujoco
 from rlctl_robot.identify.log import Array
-from rlctl_robot.identify.motion import Motion
+from rlctl_robot.identify.motion import ServoLog
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
     COULOMB,
@@ -45,7 +45,7 @@ class Derivatives:
     accelerations: Array
 
 
-def differentiate(motion: Motion) -> Derivatives:
+def differentiate(motion: ServoLog) -> Derivatives:
     """Return smoothed positions, velocities and accelerations, part by part."""
     from scipy.signal import savgol_filter
 
@@ -65,7 +65,7 @@ def differentiate(motion: Motion) -> Derivatives:
 class Regression:
     """Explains a log's differences of targets and positions by torques and friction, joint by joint."""
 
-    def __init__(self, robot: RobotModel, motion: Motion, rows: Rows) -> None:
+    def __init__(self, robot: RobotModel, motion: ServoLog, rows: Rows) -> None:
         """`rows` are those that may be used."""
         self.robot, self.motion = robot, motion
         derivatives = differentiate(motion)

@@ -37,7 +37,7 @@ _BEYOND = 1.2  # times its limit, where a joint cannot be
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Motion:
+class ServoLog:
     """What servos were told and what their encoders read, in the frame of the encoders."""
 
     joints: tuple[str, ...]
@@ -56,7 +56,7 @@ class Motion:
         return [0, *np.cumsum(self.lengths)[:-1].tolist()]
 
 
-def read_motion(path: Path, joints: Sequence[str], given: Path | None = None) -> Motion:
+def read_motion(path: Path, joints: Sequence[str], given: Path | None = None) -> ServoLog:
     """Read a log of some or all of `joints`; raises `ArtifactError` that names row and column, and what to change."""
     header = read_header(path)
     assigned, found = _assign(header, joints, given)
@@ -68,7 +68,7 @@ def read_motion(path: Path, joints: Sequence[str], given: Path | None = None) ->
     control_dt = _find_period(table, assigned)
     lengths, notes = split_segments(table, assigned, control_dt)
     positions, commands = assigned.stack(table.columns)
-    return Motion(
+    return ServoLog(
         joints=found,
         commands=commands,
         positions=positions,
@@ -140,7 +140,7 @@ def _find_period(table: LogTable, assigned: ColumnAssignment) -> float:
     return usual
 
 
-def check_positions(motion: Motion, robot: RobotModel) -> None:
+def check_positions(motion: ServoLog, robot: RobotModel) -> None:
     """Raise `ArtifactError` for an encoder that wraps and for degrees."""
     where = motion.table.where
     for values, names in ((motion.positions, motion.columns), (motion.commands, motion.command_columns)):

@@ -15,7 +15,7 @@ from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression, differentiate
 from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise
 from rlctl_robot.identify.log import Array
-from rlctl_robot.identify.motion import Motion, check_positions, read_motion
+from rlctl_robot.identify.motion import ServoLog, check_positions, read_motion
 from rlctl_robot.identify.robot_model import (
     ARMATURE,
     BACKLASH,
@@ -181,7 +181,7 @@ def identify_robot(
     )
 
 
-def _guess_start(robot: RobotModel, motion: Motion, regression: Regression, chosen: Collection[str]) -> Values:
+def _guess_start(robot: RobotModel, motion: ServoLog, regression: Regression, chosen: Collection[str]) -> Values:
     """Return a first guess of the chosen quantities, and the file's values of the others."""
     guess = regression.guess("stiffness" in chosen)
     guess[BACKLASH] = np.full(len(robot.joints), _FIRST_BACKLASH)
@@ -191,7 +191,7 @@ def _guess_start(robot: RobotModel, motion: Motion, regression: Regression, chos
 
 
 def _make_player(
-    robot: RobotModel, motion: Motion, regression: Regression, chosen: Collection[str], threads: int
+    robot: RobotModel, motion: ServoLog, regression: Regression, chosen: Collection[str], threads: int
 ) -> WindowPlayer:
     if "backlash" not in chosen:
         return WindowPlayer(robot, motion.commands, motion.control_dt, threads)
@@ -206,7 +206,7 @@ def _make_player(
 def _fit(
     player: WindowPlayer,
     unknowns: UnknownValues,
-    motion: Motion,
+    motion: ServoLog,
     starts: Array,
     steps: int,
     report: Callable[[str], None],
@@ -233,12 +233,12 @@ def _check_stiffness(robot: RobotModel, chosen: Collection[str]) -> None:
         )
 
 
-def _find_moving(motion: Motion) -> list[int]:
+def _find_moving(motion: ServoLog) -> list[int]:
     """Return the joints that move."""
     return np.flatnonzero(np.ptp(motion.positions, axis=0) > _LEAST_MOTION).tolist()
 
 
-def _hold_out(motion: Motion) -> Flags:
+def _hold_out(motion: ServoLog) -> Flags:
     """Return which rows no value is fitted to: the end of each fifth of the log, (rows,)."""
     edges = np.linspace(0, len(motion.positions), _PARTS + 1)
     position = np.arange(len(motion.positions))
@@ -248,7 +248,7 @@ def _hold_out(motion: Motion) -> Flags:
     return held_out
 
 
-def _choose_windows(motion: Motion, is_held_out: Flags) -> tuple[Array, int]:
+def _choose_windows(motion: ServoLog, is_held_out: Flags) -> tuple[Array, int]:
     """Return the first rows of the windows, and their control steps; raises `AnswerIsNo` if there are too few."""
     steps = max(4, round(_WINDOW_S / motion.control_dt))
     starts: list[int] = []
@@ -270,7 +270,7 @@ def _choose_windows(motion: Motion, is_held_out: Flags) -> tuple[Array, int]:
     return np.array(starts[::every]), steps
 
 
-def _hold_still(values: Values, motion: Motion, moving: Collection[int]) -> Values:
+def _hold_still(values: Values, motion: ServoLog, moving: Collection[int]) -> Values:
     """Return values with which the joints that do not move stay where they are."""
     still = [joint for joint in range(len(motion.joints)) if joint not in moving]
     changed = {name: np.array(value, np.float64) for name, value in values.items()}
@@ -286,7 +286,7 @@ def _take_nominal(robot: RobotModel, after: Values) -> Values:
     return values
 
 
-def play_through(player: WindowPlayer, motion: Motion, candidates: list[Values]) -> Array:
+def play_through(player: WindowPlayer, motion: ServoLog, candidates: list[Values]) -> Array:
     """Return the errors of the positions when each part of the log is played from its first row, measured nowhere else.
 
     Shape (candidates, rows, joints).
@@ -305,7 +305,7 @@ def play_through(player: WindowPlayer, motion: Motion, candidates: list[Values])
 
 
 def _find_unexplained(
-    motion: Motion, errors: Array, is_held_out: Flags, moving: Collection[int], after: Values
+    motion: ServoLog, errors: Array, is_held_out: Flags, moving: Collection[int], after: Values
 ) -> list[int]:
     """Return the joints that the simulation does not follow with the best values, or less well than with the file's."""
     late = round(float(after[DELAY]) / motion.control_dt)
@@ -318,7 +318,7 @@ def _find_unexplained(
 
 
 def _describe_value(
-    unknowns: UnknownValues, fit: WindowFit, index: int, robot: RobotModel, motion: Motion, bad: Collection[int]
+    unknowns: UnknownValues, fit: WindowFit, index: int, robot: RobotModel, motion: ServoLog, bad: Collection[int]
 ) -> RobotValue:
     item, value = unknowns.items[index], float(fit.vector[index])
     # What the simulation does not explain is alike from row to row, and says less than as much noise would.
@@ -337,7 +337,7 @@ def _describe_value(
 
 
 def _find_widest(
-    item: Unknown, value: float, robot: RobotModel, motion: Motion, fit: WindowFit, unknowns: UnknownValues
+    item: Unknown, value: float, robot: RobotModel, motion: ServoLog, fit: WindowFit, unknowns: UnknownValues
 ) -> float:
     """Return the half width of an interval at which a value counts as known."""
     widest = max(WIDEST * abs(value), _MIN_KNOWN.get(item.quantity, 0.0))
