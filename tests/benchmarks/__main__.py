@@ -63,6 +63,8 @@ ROWS = {
     "diagnose-walk": "diagnosing:walk",
     "diagnose-swaps-reach": "swaps:reach",
     "diagnose-swaps-walk": "swaps:walk",
+    "identify-arm": "identifying:arm",
+    "identify-quadruped": "identifying:quadruped",
     "zoo-ppo-reach": "zoo:ppo_reach",
     "zoo-ppo-half-cheetah": "zoo:ppo_half_cheetah",
     "zoo-sac-half-cheetah": "zoo:sac_half_cheetah",

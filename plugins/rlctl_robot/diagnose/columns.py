@@ -15,12 +15,13 @@ from rlctl.storage import yaml_text
 from rlctl.storage.validation import Number, Section
 from rlctl_robot.diagnose.signals import ACTIONS, Array
 
+JOINT_POSITIONS, JOINT_TARGETS = "joint_positions", "joint_targets"
 _CLOSE = 0.72  # similarity of names, from 0 to 1
-_TIMES = ("time", "t", "timestamp", "stamp", "time_s")
-_EPISODES = ("episode", "segment", "trial", "episode_index")
+TIMES = ("time", "t", "timestamp", "stamp", "time_s")
+EPISODES = ("episode", "segment", "trial", "episode_index")
 _PREFIXES = ("observation_", "observations_", "obs_")
 _SYNONYMS = {
-    "joint_positions": ("q", "qpos", "position", "positions", "joint_pos", "dof_pos", "joint_angles", "state"),
+    JOINT_POSITIONS: ("q", "qpos", "position", "positions", "joint_pos", "dof_pos", "joint_angles", "state"),
     "joint_velocities": ("dq", "qd", "qvel", "velocity", "velocities", "joint_vel", "dof_vel", "joint_speeds"),
     "angular_velocity": ("gyro", "gyroscope", "omega", "ang_vel", "base_ang_vel"),
     "gyroscope": ("gyro", "omega", "ang_vel", "base_ang_vel", "angular_velocity"),
@@ -30,6 +31,11 @@ _SYNONYMS = {
     "command": ("commands", "cmd", "velocity_commands"),
     "last_action": ("last_actions", "prev_action", "previous_action"),
     ACTIONS: ("action", "act", "a", "policy_action"),
+    JOINT_TARGETS: (
+        *("target", "targets", "target_position", "target_positions", "command", "commands", "cmd", "goal", "desired"),
+        *("q_des", "q_target", "des_dof_pos", "desired_position", "goal_position", "position_command", "action"),
+        "actions",
+    ),
 }
 _SUFFIXES = {3: (("x", "y", "z"), ("roll", "pitch", "yaw")), 4: (("x", "y", "z", "w"), ("qx", "qy", "qz", "qw"))}
 
@@ -94,7 +100,7 @@ def assign_columns(path: Path, names: Sequence[str], info: EnvInfo, size: int, g
     column_map = ColumnMap() if given is None else yaml_text.read_model(given, ColumnMap)
     for name in column_map.observations:
         check_name(name, terms, f"{given}: the policy has no observation", ArtifactError)
-    finder = _Finder(path, names, info)
+    finder = ColumnFinder(path, names, info.joints.names if info.joints is not None else ())
     inputs = {} if column_map.observations else _find_inputs(finder, info, size)
     found: dict[str, tuple[str, ...]] = {}
     flat = None
@@ -112,19 +118,20 @@ def assign_columns(path: Path, names: Sequence[str], info: EnvInfo, size: int, g
             found[name] = finder.check(given or path, name, explicit, count)
         elif name not in found:
             found[name] = finder.find(name, count)
-    _refuse_shared(path, found)
-    time = column_map.time or finder.find_one(_TIMES)
-    episode = column_map.episode or finder.find_one(_EPISODES)
+    refuse_shared(path, found)
+    time = column_map.time or finder.find_one(TIMES)
+    episode = column_map.episode or finder.find_one(EPISODES)
     for column in (column_map.time, column_map.episode):
         if column is not None:
             check_name(column, names, f"{given}: {path} has no column", ArtifactError)
-    units = _read_units(given, column_map, {name: len(columns) for name, columns in found.items()})
+    units = read_units(given, column_map, {name: len(columns) for name, columns in found.items()})
     chosen = found.pop(ACTIONS)
     is_of_controller = bool(inputs) and flat is None
     return ColumnAssignment(found, chosen, time, episode, tuple(finder.notes), is_of_controller, units)
 
 
-def _read_units(given: Path | None, column_map: ColumnMap, sizes: Mapping[str, int]) -> dict[str, tuple[Array, Array]]:
+def read_units(given: Path | None, column_map: ColumnMap, sizes: Mapping[str, int]) -> dict[str, tuple[Array, Array]]:
+    """Return factor and offset of observations and actions, `sizes` elements each; raises `ArtifactError`."""
     units = {}
     for name in {**column_map.scale, **column_map.offset}:
         check_name(name, sizes, f"{given}: scale and offset are of observations and {ACTIONS}, not of", ArtifactError)
@@ -139,7 +146,7 @@ def _read_units(given: Path | None, column_map: ColumnMap, sizes: Mapping[str, i
     return units
 
 
-def _find_inputs(finder: "_Finder", info: EnvInfo, size: int) -> dict[str, tuple[str, ...]]:
+def _find_inputs(finder: "ColumnFinder", info: EnvInfo, size: int) -> dict[str, tuple[str, ...]]:
     """Return the columns of a controller's inputs; empty unless all are there and a computed term is not."""
     sizes = info.observation_sizes
     computed = [name for name, term in info.observation_terms.items() if name not in term.inputs and name in sizes]
@@ -154,7 +161,8 @@ def _count_actions(info: EnvInfo) -> int:
     return int(shape[0]) if shape else 1
 
 
-def _refuse_shared(path: Path, found: Mapping[str, Sequence[str]]) -> None:
+def refuse_shared(path: Path, found: Mapping[str, Sequence[str]]) -> None:
+    """Raise `ArtifactError` if two terms have the same column."""
     owner: dict[str, str] = {}
     for name, columns in found.items():
         for column in columns:
@@ -173,17 +181,22 @@ def _simplify(name: str) -> str:
     return text
 
 
-class _Finder:
-    def __init__(self, path: Path, names: Sequence[str], info: EnvInfo) -> None:
-        self._path, self._info = path, info
+class ColumnFinder:
+    """Finds the columns of quantities by their names: exact ones, those of `_SYNONYMS`, and close ones."""
+
+    def __init__(self, path: Path, names: Sequence[str], joints: Sequence[str]) -> None:
+        """`names` are those of all columns, `joints` those of the robot, with which columns may end."""
+        self._path, self._joints = path, joints
         self._by_text = {_simplify(name): name for name in names}
         self._names = names
         self.notes: list[str] = []
 
     def find_one(self, texts: Sequence[str]) -> str | None:
+        """Return the first column with one of the names; None if there is none."""
         return next((self._by_text[text] for text in texts if text in self._by_text), None)
 
     def check(self, where: Path, term: str, columns: Sequence[str], count: int) -> tuple[str, ...]:
+        """Return the columns that a file gives for a term; raises `ArtifactError` if they are not all there."""
         if len(columns) != count:
             raise ArtifactError(f"{where}: {term} has {count} elements, and {len(columns)} columns are given")
         for column in columns:
@@ -200,7 +213,15 @@ class _Finder:
                     return tuple(self._by_text[key] for key in keys)
         return None
 
+    def find_joints(self, term: str) -> tuple[str, ...]:
+        """Return the joints of which a term has a column, by their names."""
+        texts = (term, term.removesuffix("s"), *_SYNONYMS.get(term, ()))
+        return tuple(
+            joint for joint in self._joints if any(f"{text}_{_simplify(joint)}" in self._by_text for text in texts)
+        )
+
     def find(self, term: str, count: int) -> tuple[str, ...]:
+        """Return the columns of a term; raises `ArtifactError` if they cannot be decided."""
         own = (term, term.removesuffix("s")) if term == ACTIONS else (term,)
         for text in (*own, *_SYNONYMS.get(term, ())):
             if (columns := self._find_by_text(text, count)) is not None:
@@ -214,10 +235,9 @@ class _Finder:
             return (self._by_text[text],)
         if (columns := self.find_indexed((text,), count)) is not None:
             return columns
-        joints = self._info.joints
         suffixes = [*_SUFFIXES.get(count, ())]
-        if joints is not None and len(joints.names) == count:
-            own = tuple(_simplify(joint) for joint in joints.names)
+        if self._joints and len(self._joints) == count:
+            own = tuple(_simplify(joint) for joint in self._joints)
             suffixes += [own, tuple(f"{joint}_pos" for joint in own)]  # LeRobot's names of joints
         for some in suffixes:
             if all(f"{text}_{suffix}" in self._by_text for suffix in some):

@@ -61,7 +61,7 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     if len(table.rows) < 2:
         count = f"{len(table.rows)} row{'' if len(table.rows) == 1 else 's'}"
         raise ArtifactError(f"{path}: {count} after the header; diagnose needs {_LEAST_ROWS} or more")
-    lengths, notes = _split(table, assigned, info.control_dt)
+    lengths, notes = split_segments(table, assigned, info.control_dt)
     observations, actions = assigned.stack(table.columns)
     sizes = {name: len(some) for name, some in assigned.observations.items()}
     keep = np.repeat(np.array(lengths) >= _LEAST_SEGMENT, lengths)
@@ -86,8 +86,13 @@ def read_robot_log(path: Path, info: EnvInfo, columns: Path | None = None) -> Ro
     return RobotLog(signals, table, tuple(all_notes), np.flatnonzero(keep), limited, inputs)
 
 
-def _split(table: LogTable, assigned: ColumnAssignment, control_dt: float | None) -> tuple[list[int], list[str]]:
-    """Return the lengths of the segments, and notes about gaps."""
+def split_segments(
+    table: LogTable, assigned: ColumnAssignment, control_dt: float | None
+) -> tuple[list[int], list[str]]:
+    """Return the lengths of the segments, and notes about gaps.
+
+    Raises `ArtifactError` for another rate than `control_dt` [s], mixed rates and decreasing time.
+    """
     notes = []
     breaks = np.zeros(len(table.rows), bool)
     breaks[np.cumsum((0, *table.windows[:-1]))[np.array(table.windows) > 0]] = True

@@ -15,12 +15,10 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo
 from rlctl.play.workers import available_cores
 from rlctl_robot.identify.follow import Follower, Unknowns, describe_expected, find_unknowns, open_world
+from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise
 from rlctl_robot.identify.log import Array, Log, check_actions, read_log
 from rlctl_robot.identify.search import Fit, search, start_search_workers
 
-CONFIDENCE = 1.96  # standard deviations of a 95 % interval
-WIDEST = 0.3  # a value is unknown if its interval is wider than this fraction of it, to each side
-_MIN_COMPONENT = 0.3  # smallest component of a value in a direction, for its name to be listed
 _MIN_WIDTH = 0.02
 """Smallest half width of a training interval, relative to the value: intervals leave out the model's errors."""
 _MIN_MOTION = 1e-3  # [rad or m]
@@ -141,8 +139,7 @@ def identify(
 def _check_errors(file: Path, follower: Follower, log: Log, before: float, after: float) -> None:
     """Raise `AnswerIsNo` where the simulation does not follow the log: its values are those of another motion."""
     motion = _root_mean_squares(follower.motion)[0]
-    # Third differences remove the motion; they have 1 + 9 + 9 + 1 times the variance of the noise.
-    noise = float(np.sqrt(np.square(np.diff(log.positions, 3, axis=0)).mean() / 20))
+    noise = float(np.sqrt(np.square(measure_noise(log.positions)).mean()))
     if after > max(_LARGEST_ERROR * motion, _NOISE_RATIO * noise):
         raise AnswerIsNo(
             f"{file}: the task does not explain this log: the simulated positions are wrong by {after:.3g} rad "
@@ -201,7 +198,7 @@ def _estimate_value(
         limit = WIDEST * max(abs(value), 0.1 * parameter.relative_span)
     known, note = half <= limit, ""
     if not known and CONFIDENCE * alone <= limit:
-        note = _explain_unknown(unknowns, index, information)
+        note = explain_unknown([other.name for other in unknowns.parameters], index, information)
     elif not known:
         note = f"this log contains no information about {parameter.name}"
     elif min(position, 1 - position) < 0.005:
@@ -209,16 +206,6 @@ def _estimate_value(
         note = f"the estimate is at the end of its search range, {end:.3g}: the cause may be something else"
         known = False
     return IdentifiedValue(parameter.name, parameter.event, parameter.key, value, float(low), float(high), known, note)
-
-
-def _explain_unknown(unknowns: Unknowns, index: int, information: Array) -> str:
-    """Name the values that can change together without an effect on the log."""
-    sizes, directions = np.linalg.eigh(information)
-    shares = np.abs(directions[index]) / np.sqrt(np.maximum(sizes, 1e-12 * sizes[-1]))
-    direction = directions[:, int(shares.argmax())]
-    own, large = unknowns.parameters[index], np.flatnonzero(np.abs(direction) >= _MIN_COMPONENT)
-    others = [unknowns.parameters[other].name for other in large if other != index] or ["the others"]
-    return f"this log cannot tell {own.name} from {' and '.join(others)}"
 
 
 def show(result: Identification, json: str | None) -> None:

@@ -1,0 +1,249 @@
+"""Least squares over windows of a log: values of the robot, and the state with which each window begins.
+
+Multiple shooting: the joints' states at the beginning of each window are unknown too, so that the noise of encoders
+and of velocities that are computed from them does not bend the values. They are eliminated window by window, so a step
+of Gauss and Newton costs one world per window and group of values.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from rlctl_robot.identify.log import Array
+from rlctl_robot.identify.unknowns import UnknownValues
+from rlctl_robot.identify.windows import WindowPlayer
+
+_MOST_ITERATIONS = 15
+ENOUGH = 0.5  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
+_NEAR = 0.2  # relative decrease of the cost, below which derivatives hold for the next step too
+_DAMPINGS = (0.01, 0.1, 1.0, 10.0, 1000.0)  # factors of the last damping, tried in one batch
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-9, 1e6
+_LINEAR = 3.0  # standard deviations, beyond which an error counts linearly (Huber)
+_QUANTILE, _AT_QUANTILE = 0.9, 1.645  # of errors, and of a normal distribution
+_POSITION_STEP, _VELOCITY_STEP = 2e-4, 2e-3  # [rad or m], [rad/s or m/s], for derivatives
+_FINEST = 1e-5  # [rad or m], of a measurement
+_TIE = 1e-6  # weight with which a start state stays where it is, relative to what its window says
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WindowFit:
+    """The values with which the simulation follows the windows of a log best."""
+
+    vector: Array  # shape (unknowns,)
+    information: Array  # of the values, the start states eliminated, without what was known before: (unknowns,) * 2
+    covariance: Array  # of the values, shape (unknowns, unknowns)
+    noise: Array  # standard deviation of the errors [rad or m], shape (joints,)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Point:
+    """Values and the states at the beginning of each window, with what is simulated with them."""
+
+    vector: Array
+    positions: Array  # shape (windows, joints)
+    velocities: Array
+    errors: Array  # shape (windows, rows, joints)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Derivatives:
+    """How the errors change with the values and with the start states."""
+
+    values: Array  # shape (windows, rows, joints, unknowns)
+    states: Array  # shape (windows, rows, joints, positions and velocities)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations: of the values, of each window's start state, and between them."""
+
+    values: Array  # (unknowns, unknowns)
+    states: Array  # (windows, states, states)
+    mixed: Array  # (windows, unknowns, states)
+    values_gradient: Array  # (windows, unknowns)
+    states_gradient: Array  # (windows, states)
+
+
+class WindowFitter:
+    """Fits values to the windows of a log that begin at the rows `starts` and have `steps` control steps."""
+
+    def __init__(
+        self,
+        player: WindowPlayer,
+        unknowns: UnknownValues,
+        positions: Array,
+        velocities: Array,
+        starts: Array,
+        steps: int,
+    ) -> None:
+        """`positions` [rad or m] are the encoders', `velocities` a first guess; shape (rows, joints)."""
+        self._player, self._unknowns, self._starts, self._steps = player, unknowns, starts, steps
+        self._measured = np.stack([positions[start : start + steps + 1] for start in starts])
+        self._first = (positions[starts], velocities[starts])
+        self._lowest = unknowns.column("lowest")
+        self._center, self._doubt = unknowns.column("first"), unknowns.column("doubt")
+        trees = player.robot.trees
+        self._places = np.array([int(np.sum(trees[:joint] == trees[joint])) for joint in range(len(trees))])
+        self._same_tree = trees[:, None] == trees
+
+    def fit(self, vector: Array, report: Callable[[str], None], enough: float = ENOUGH) -> WindowFit:
+        """Return the best values near a first guess, shape (unknowns,); `enough` is the last step's decrease."""
+        point = self._play([(np.maximum(vector, self._lowest), *self._first)])[0]
+        damping, is_new = _FIRST_DAMPING, True
+        derivatives = self._differentiate(point)
+        for iteration in range(_MOST_ITERATIONS):
+            noise = self._estimate_noise(point.errors)
+            equations = self._form_equations(point, derivatives, noise)
+            cost = self._compute_cost(point, noise)
+            dampings = np.clip(damping * np.array(_DAMPINGS), _LEAST_DAMPING, _MOST_DAMPING)
+            candidates = self._play([self._step(point, equations, factor) for factor in dampings])
+            costs = np.array([self._compute_cost(candidate, noise) for candidate in candidates])
+            best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+            decrease = cost - float(costs[best])
+            if decrease > 0:
+                point, damping = candidates[best], float(dampings[best])
+            report(f"step {iteration + 1}: remaining error {np.sqrt(np.square(point.errors).mean()):.3g}")
+            if is_new and decrease < enough:
+                if decrease > 0 or damping >= _MOST_DAMPING:
+                    break
+                damping = min(1000.0 * damping, _MOST_DAMPING)
+                continue
+            is_new = decrease > _NEAR * cost or decrease < enough
+            if is_new:
+                derivatives = self._differentiate(point)
+        return self._finish(point, derivatives)
+
+    def _play(self, starts: list[tuple[Array, Array, Array]]) -> list[_Point]:
+        """Simulate all windows for several values and start states in one batch."""
+        windows = len(self._starts)
+        vectors = np.repeat(np.array([vector for vector, _, _ in starts]), windows, axis=0)
+        played = self._player.play(
+            self._unknowns.values(vectors),
+            np.tile(self._starts, len(starts)),
+            np.concatenate([positions for _, positions, _ in starts]),
+            np.concatenate([velocities for _, _, velocities in starts]),
+            self._steps,
+        )
+        errors = played.reshape(len(starts), *self._measured.shape) - self._measured
+        return [_Point(*start, error) for start, error in zip(starts, errors, strict=True)]
+
+    def _estimate_noise(self, errors: Array) -> Array:
+        """Return the standard deviation of each joint's errors, on which outliers have little influence."""
+        # Not the median: a joint that rests for most of the time must not make its motion an outlier.
+        middle = np.maximum(np.quantile(np.abs(errors), _QUANTILE, axis=(0, 1)) / _AT_QUANTILE, _FINEST)
+        clipped = np.clip(errors, -_LINEAR * middle, _LINEAR * middle)
+        noise: Array = np.maximum(np.sqrt(np.square(clipped).mean(axis=(0, 1))), _FINEST)
+        return noise
+
+    def _compute_cost(self, point: _Point, noise: Array) -> float:
+        sizes = np.abs(point.errors / noise)
+        costs = np.where(sizes < _LINEAR, np.square(sizes) / 2, _LINEAR * sizes - _LINEAR**2 / 2)
+        known = np.square((point.vector - self._center) / self._doubt).sum() / 2
+        return float(costs.sum() + known)
+
+    def _differentiate(self, point: _Point) -> _Derivatives:
+        """Compute all derivatives in one batch of worlds."""
+        unknowns, joints = self._unknowns, range(len(self._places))
+        steps = unknowns.column("step")
+        groups = np.array([item.group for item in unknowns.items])
+        starts = [(point.vector, point.positions, point.velocities)]
+        for group in range(unknowns.groups):
+            changed = point.vector + steps * (groups == group)
+            starts.append((changed, point.positions, point.velocities))
+        places = int(self._places.max()) + 1
+        for place in range(places):
+            starts.append((point.vector, point.positions + _POSITION_STEP * (self._places == place), point.velocities))
+        for place in range(places):
+            starts.append((point.vector, point.positions, point.velocities + _VELOCITY_STEP * (self._places == place)))
+        played = self._play(starts)
+        by_group = [one.errors - played[0].errors for one in played[1:]]
+        values = [
+            by_group[item.group] / step * unknowns.affected[:, number]
+            for number, (item, step) in enumerate(zip(unknowns.items, steps, strict=True))
+        ]
+        states = [
+            by_group[begin + self._places[joint]] / step * self._same_tree[joint]
+            for begin, step in ((unknowns.groups, _POSITION_STEP), (unknowns.groups + places, _VELOCITY_STEP))
+            for joint in joints
+        ]
+        return _Derivatives(np.stack(values, axis=-1), np.stack(states, axis=-1))
+
+    def _form_equations(self, point: _Point, derivatives: _Derivatives, noise: Array) -> _Equations:
+        """Return the normal equations at a point, with derivatives that were computed near it."""
+        sizes = np.abs(point.errors / noise)
+        weights = np.sqrt(np.where(sizes < _LINEAR, 1.0, _LINEAR / np.maximum(sizes, 1e-9))) / noise
+        windows = len(self._starts)
+        errors = (point.errors * weights).reshape(windows, -1)
+        of_values, of_states = (
+            (part * weights[..., None]).reshape(windows, errors.shape[1], -1)
+            for part in (derivatives.values, derivatives.states)
+        )
+        flat = of_values.reshape(-1, of_values.shape[-1])
+        return _Equations(
+            values=flat.T @ flat,
+            states=_tie(np.swapaxes(of_states, 1, 2) @ of_states),
+            mixed=np.swapaxes(of_values, 1, 2) @ of_states,
+            values_gradient=np.einsum("wip,wi->wp", of_values, errors),
+            states_gradient=np.einsum("wip,wi->wp", of_states, errors),
+        )
+
+    def _reduce(self, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
+        """Eliminate the start states: return the matrix and gradients (windows, unknowns) of the values alone."""
+        size = equations.states.shape[-1]
+        inverse = np.asarray(np.linalg.inv(equations.states * (1.0 + damping * np.eye(size))), np.float64)
+        influence = equations.mixed @ inverse
+        matrix = equations.values - np.einsum("wps,wqs->pq", influence, equations.mixed, optimize=True)
+        gradients = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
+        return matrix, gradients, inverse
+
+    def _step(self, point: _Point, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
+        """Return the values and start states after a step of Levenberg and Marquardt within the values' bounds."""
+        matrix, gradients, inverse = self._reduce(equations, damping)
+        known = 1.0 / np.square(self._doubt)
+        matrix = matrix + np.diag(known)
+        gradient = gradients.sum(axis=0) + known * (point.vector - self._center)
+        matrix = matrix + damping * np.diag(np.diag(equations.values) + known)
+        change = _solve_bounded(matrix, gradient, self._lowest - point.vector)
+        pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
+        moved = -np.einsum("wst,wt->ws", inverse, pull)
+        joints = len(self._places)
+        return (
+            np.maximum(point.vector + change, self._lowest),
+            point.positions + moved[:, :joints],
+            point.velocities + moved[:, joints:],
+        )
+
+    def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
+        noise = self._estimate_noise(point.errors)
+        equations = self._form_equations(point, derivatives, noise)
+        information, gradients, _ = self._reduce(equations, 0.0)
+        known = np.diag(1.0 / np.square(self._doubt))
+        inverse = np.linalg.inv(information + known)
+        # Errors of a window are alike, such as those of the model: what the windows say differs more than their noise.
+        gradients = gradients - gradients.mean(axis=0)
+        count = len(gradients)
+        spread = count / max(count - 1, 1) * gradients.T @ gradients
+        measured = inverse @ spread @ inverse
+        widen = np.sqrt(np.maximum(1.0, np.diag(measured) / np.diag(inverse)))
+        return WindowFit(point.vector, information, inverse * np.outer(widen, widen), noise)
+
+
+def _tie(matrices: Array) -> Array:
+    size = matrices.shape[-1]
+    sizes = np.trace(matrices, axis1=1, axis2=2)[:, None, None] / size
+    tied: Array = matrices + _TIE * np.maximum(sizes, 1e-12) * np.eye(size)
+    return tied
+
+
+def _solve_bounded(matrix: Array, gradient: Array, lowest: Array) -> Array:
+    """Return the step that minimises a quadratic; components that would fall below `lowest` end there."""
+    change = np.linalg.solve(matrix, -gradient)
+    held = change < lowest
+    if not held.any() or held.all():
+        return np.maximum(change, lowest)
+    free = ~held
+    change[held] = lowest[held]
+    pull = gradient[free] + matrix[np.ix_(free, held)] @ change[held]
+    change[free] = np.linalg.solve(matrix[np.ix_(free, free)], -pull)
+    return np.maximum(change, lowest)
