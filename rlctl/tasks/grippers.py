@@ -59,6 +59,11 @@ class Gripper:
     others: list[str]  # names of joints of other grippers
 
     @property
+    def driven(self) -> list[int]:
+        """The joints that motors of a task move, which are all; drivers go first."""
+        return [*self.drivers, *(joint for joint in self.joints if joint not in self.drivers)]
+
+    @property
     def has_fixed_finger(self) -> bool:
         """Whether one finger does not move, as on many small arms."""
         return self.palm in self.fingers[1]
@@ -148,7 +153,7 @@ class GripperSearch:
         drivers = linkage.choose_drivers(beyond)
         if not 0 < len(drivers) <= _MOST_DRIVERS:  # without any, joints nearer to the base move all of them
             return None
-        groups = [self._list_finger(joint) for joint in beyond if linkage.parents[joint] == palm]
+        groups = linkage.join_loops([self._list_finger(joint) for joint in beyond if linkage.parents[joint] == palm])
         fixed = linkage.list_links(palm)
         sets = [(one, other) for index, one in enumerate(groups) for other in groups[index + 1 :]]
         is_pair = bool(sets)
