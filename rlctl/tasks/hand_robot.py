@@ -72,7 +72,7 @@ class _Hand:
 
     @property
     def tolerance(self) -> float:
-        return float(f"{max(0.03 * self.scale, 0.4 * self.gripper.width):.1g}")
+        return float(f"{max(0.036 * self.scale, 0.4 * self.gripper.width):.2g}")
 
 
 def read_hand_robot(model: str, kind: str, *, gripper: str | None = None, tip: str | None = None) -> StarterRobot:
