@@ -24,6 +24,7 @@ _TOUCH = 2e-3  # [m], between points of surfaces that touch
 _REMAINS = 0.35  # of the opening: fingers that come no nearer do not close
 _OPEN = 0.5  # of the opening: where the gripper is open
 _LEAST_OPENING = 8e-3  # [m]
+_APPROACHES = 0.95  # of the opening: what comes no nearer was not meant as a gripper
 _OUTER = 0.5  # of a jaw's length from its hinge: where it grips
 _TILT = 0.4  # [rad], of the finger's face against a block
 _SNAP = 0.3  # [rad], from an axis of the palm
@@ -57,6 +58,11 @@ class Gripper:
     width: float  # of the block [m]
     height: float  # of the block [m]
     others: list[str]  # names of joints of other grippers
+
+    @property
+    def driven(self) -> list[int]:
+        """The joints that motors of a task move, which are all; drivers go first."""
+        return [*self.drivers, *(joint for joint in self.joints if joint not in self.drivers)]
 
     @property
     def has_fixed_finger(self) -> bool:
@@ -110,18 +116,17 @@ class GripperSearch:
             others = [one for one in pairs or closing if not self._overlap(one, chosen)]
             return self._describe(chosen, sorted({self._names[one.drivers[0]] for one in others}))
         near = max(closings, key=lambda one: one.opening - float(one.gaps.min()), default=None)
-        approaches = near is not None and near.gaps.min() < 0.8 * near.opening
-        if near is not None and (joint is not None or approaches):
-            first, second = (fingers[-1] for fingers in near.fingers)
+        if near is None or near.opening < _LEAST_OPENING or near.gaps.min() > _APPROACHES * near.opening:
+            which = "" if joint is None else f" with joint {joint!r}"
             raise UsageError(
-                f"--model: {file}: the gripper never closes: between {first!r} and {second!r} remain "
-                f"{1e3 * near.gaps.min():.0f} of {1e3 * near.opening:.0f} mm; correct the limits of "
-                f"{self._list_names(near.drivers)}, or name another joint with --gripper JOINT"
+                f"--model: {file}: no gripper{which}: no joint at its end moves a link towards another one; "
+                "name one with --gripper JOINT, or without --pick make a task in which the arm reaches"
             )
-        which = "" if joint is None else f" with joint {joint!r}"
+        first, second = (fingers[-1] for fingers in near.fingers)
         raise UsageError(
-            f"--model: {file}: no gripper{which}: no joint at its end moves a link towards another one; "
-            "name one with --gripper JOINT, or without --pick make a task in which the arm reaches"
+            f"--model: {file}: the gripper never closes: between {first!r} and {second!r} remain "
+            f"{1e3 * near.gaps.min():.0f} of {1e3 * near.opening:.0f} mm; correct the limits of "
+            f"{self._list_names(near.drivers)}, or name another joint with --gripper JOINT"
         )
 
     def _overlap(self, one: _Closing, other: _Closing) -> bool:
@@ -148,7 +153,7 @@ class GripperSearch:
         drivers = linkage.choose_drivers(beyond)
         if not 0 < len(drivers) <= _MOST_DRIVERS:  # without any, joints nearer to the base move all of them
             return None
-        groups = [self._list_finger(joint) for joint in beyond if linkage.parents[joint] == palm]
+        groups = linkage.join_loops([self._list_finger(joint) for joint in beyond if linkage.parents[joint] == palm])
         fixed = linkage.list_links(palm)
         sets = [(one, other) for index, one in enumerate(groups) for other in groups[index + 1 :]]
         is_pair = bool(sets)

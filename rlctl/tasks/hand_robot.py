@@ -15,6 +15,7 @@ from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.tasks.finger_shapes import find_unfit, fit_boxes, replace_shapes
 from rlctl.tasks.grippers import Gripper, GripperSearch
 from rlctl.tasks.linkage import Linkage
+from rlctl.tasks.loops import replace_loops, write_armature
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
 from rlctl.tasks.motors import ChosenMotors, choose_motors
 from rlctl.tasks.shapes import Array, Shapes
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 TEMPLATE = Path(__file__).with_name("template_pick")
 """Templates of the files that differ from those of an arm that reaches."""
-_CONTROL_DT, _SUBSTEPS = 0.04, 10
+_CONTROL_DT, _SUBSTEPS = 0.04, 6
 _DENSITY = 1000.0  # [kg/m^3], of the block
 _LONGEST, _BIGGEST_MESH = 20.0, 5.0  # [m], of an arm; of the reach, of a link's shapes
 _FASTEST = {False: 1.2, True: 0.25}  # [rad/s], and [m/s] of joints that slide
@@ -37,7 +38,7 @@ _IN_TABLE = 1e-3  # [m]
 _CAMERA_AWAY, _CAMERA_HEIGHT, _CAMERA_TARGET = 0.8, 0.7, 0.1  # of the reach, from the middle of the area
 _WRIST_BEHIND, _WRIST_ASIDE = 0.1, 0.08  # [m], from the tip, of an arm of that reach
 _INCLINED = 0.1  # [rad]
-_STEPS = {"pick": 6_000_000, "place": 8_000_000, "push": 3_000_000}
+_STEPS = {"pick": 4_000_000, "place": 6_000_000, "push": 3_000_000}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,21 +71,8 @@ class _Hand:
         return float(f"{_DENSITY * np.prod(self.block):.2g}")
 
     @property
-    def driven(self) -> list[int]:
-        """The gripper's joints that have motors."""
-        return _choose_driven(self.linkage, self.gripper)
-
-    @property
     def tolerance(self) -> float:
-        return float(f"{max(0.03 * self.scale, 0.4 * self.gripper.width):.1g}")
-
-
-def _choose_driven(linkage: Linkage, gripper: Gripper) -> list[int]:
-    """Return the joints that motors move: all that follow by a fixed ratio, but none in a loop of links."""
-    joints_only = int(linkage._mujoco.mjtEq.mjEQ_JOINT)
-    if all(int(kind) == joints_only for kind in linkage.model.eq_type):
-        return [*gripper.drivers, *(joint for joint in gripper.joints if joint not in gripper.drivers)]
-    return gripper.drivers
+        return float(f"{max(0.036 * self.scale, 0.4 * self.gripper.width):.2g}")
 
 
 def read_hand_robot(model: str, kind: str, *, gripper: str | None = None, tip: str | None = None) -> StarterRobot:
@@ -103,6 +91,11 @@ def read_hand_robot(model: str, kind: str, *, gripper: str | None = None, tip: s
         linkage = _load(copy, model)
         surfaces = _read_surfaces(copy, linkage)
         found = _find_gripper(linkage, surfaces, gripper, tip)
+        looped = replace_loops(files, Path(path.name), linkage, found)
+        if looped:
+            notes += looped
+            _write({Path(path.name): files[Path(path.name)]}, copy.parent)
+            linkage = _load(copy, model)
         unfit = find_unfit(copy, linkage, found)
         boxes = fit_boxes(unfit, linkage, surfaces, found)
         if boxes:
@@ -111,6 +104,9 @@ def read_hand_robot(model: str, kind: str, *, gripper: str | None = None, tip: s
             linkage = _load(copy, model)
         boxed = {link: len(fitted) for link, fitted in boxes.items()}
         hand = _place(kind, path, linkage, found, boxed)
+        if looped:
+            names, armature = linkage.body.joint_names, hand.motors.armature
+            write_armature(files, Path(path.name), {names[joint]: armature[joint] for joint in found.joints})
         files[Path("block.urdf")] = _write_block(hand)
         values, summary = _describe(hand), _summarize(hand, notes)
     kept = frozenset({kind})
@@ -186,7 +182,7 @@ def _place(kind: str, path: Path, linkage: Linkage, gripper: Gripper, boxed: dic
     lowest = min(lowest, float(base[2])) if math.isinf(lowest) else lowest
     raised = math.ceil(1e3 * -lowest) / 1e3 if lowest < -_IN_TABLE else 0.0
     table, height = find_table(linkage, gripper, raised, lowest)
-    motors = choose_motors(linkage, gripper, _choose_driven(linkage, gripper), table.start, _block_mass(gripper))
+    motors = choose_motors(linkage, gripper, table.start, _block_mass(gripper))
     position = np.array([0.0, 0.0, height])
     return _Hand(kind, path, linkage, gripper, table, motors, position, boxed)
 
@@ -205,7 +201,7 @@ def _write_block(hand: _Hand) -> bytes:
 <robot name="block">
   <material name="orange"><color rgba="0.95 0.42 0.05 1"/></material>
   <link name="block">
-    <contact><lateral_friction value="1.0"/><spinning_friction value="0.003"/></contact>
+    <contact><lateral_friction value="1.0"/></contact>
     <inertial><mass value="{mass:g}"/><inertia {inertia} ixy="0" ixz="0" iyz="0"/></inertial>
     <visual>{box}<material name="orange"/></visual>
     <collision>{box}</collision>
@@ -262,11 +258,9 @@ def _write_array(values: Sequence[float] | Array, form: str = "") -> SourceText:
 
 def _describe(hand: _Hand) -> dict[str, str]:
     body, gripper, table, motors = hand.body, hand.gripper, hand.table, hand.motors
-    names, driven = body.joint_names, hand.driven
-    passive = [joint for joint in gripper.joints if joint not in driven]
+    names, driven = body.joint_names, gripper.driven
     fingers = sorted({link for links in gripper.fingers for link in links if _has_shapes(hand.linkage, link)})
     speeds = [_limit_speed(hand, joint) for joint in gripper.arm]
-    forces = [force for joint, force in enumerate(motors.max_force) if joint not in passive]
     holding = gripper.open[driven[0]] - gripper.closed[driven[0]]
     share = (gripper.holding[driven[0]] - gripper.closed[driven[0]]) / holding
     scale, name = hand.scale, name_robot(hand.path)
@@ -291,8 +285,7 @@ def _describe(hand: _Hand) -> dict[str, str]:
         "stiffness": write_list("STIFFNESS = ", [write_number(value, ".3g") for value in motors.stiffness]),
         "damping": write_list("DAMPING = ", [write_number(value, ".3g") for value in motors.damping]),
         "armature": write_list("ARMATURE = ", [write_number(value, ".3g") for value in motors.armature]),
-        "max_force": write_list("MAX_FORCE = ", [write_number(value, ".3g") for value in forces]),
-        "force_comment": ", of joints with motors" if passive else "",
+        "max_force": write_list("MAX_FORCE = ", [write_number(value, ".3g") for value in motors.max_force]),
         "max_speed": write_list("MAX_SPEED = ", map(write_number, speeds)),
         "inclined": SourceText(
             f" {math.degrees(table.tilt):.0f} degrees inclined" if table.tilt > _INCLINED else " down"
@@ -310,9 +303,6 @@ def _describe(hand: _Hand) -> dict[str, str]:
         "nearest": write_number(max(2 * hand.tolerance, 0.12 * table.reach), ".2g"),
         "noise": write_number(0.1 * hand.tolerance, ".1g"),
         "fixed": _write_position(hand),
-        "passive": SourceText(f"{{{join_source(write_string(names[joint]) for joint in passive)}}}")
-        if passive
-        else SourceText("set()"),
         "released": write_number(min(0.9, share + 0.15), ".2g"),
         "total_timesteps": f"{_STEPS[hand.kind]:_}",
         "sag": write_number(0.05 * table.reach, ".2g"),

@@ -49,6 +49,30 @@ class Linkage:
             parents.append(before[-1] if before else -1)
         return parents
 
+    def list_loops(self) -> list[set[str]]:
+        """Return the pairs of links that equalities connect: they close loops of links."""
+        model, kinds = self.model, self._mujoco.mjtEq
+        closing = (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD))
+        is_site = int(self._mujoco.mjtObj.mjOBJ_SITE)
+        links = {number: name for name, number in self.body.parts.links.items()}
+        pairs = []
+        for equality in range(model.neq):
+            ends = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
+            if int(model.eq_objtype[equality]) == is_site:
+                ends = [int(model.site_bodyid[end]) for end in ends]
+            if int(model.eq_type[equality]) in closing:
+                pairs.append({links.get(end, "") for end in ends})
+        return pairs
+
+    def join_loops(self, groups: list[list[str]]) -> list[list[str]]:
+        """Return groups of links, where those that a loop connects are one."""
+        joined = groups
+        for pair in self.list_loops():
+            touched = [group for group in joined if pair & set(group)]
+            joined = [group for group in joined if group not in touched]
+            joined += [[link for group in touched for link in group]] if touched else []
+        return joined
+
     def list_beyond(self, joint: int) -> list[int]:
         """Return the joints that a joint carries, in the model's order."""
         chosen = {joint}
@@ -143,11 +167,19 @@ class Linkage:
         return {index for index, number in enumerate(self.numbers.tolist()) if number in numbers}
 
     def close_loops(self, positions: Array, dependent: Sequence[int]) -> Array:
-        """Return positions of all joints in which some are moved so that the model's equalities hold."""
+        """Return positions of all joints in which some are moved so that the model's equalities hold.
+
+        Where these leave joints free, the joints' springs move them, up to their limits.
+        """
         positions = np.array(positions, float)
         if not dependent or not self.model.neq:
             return positions
         chosen = list(dependent)
+        positions = self._solve_loops(positions, chosen)
+        springs = self.model.jnt_stiffness[self.numbers[chosen]]
+        return self._relax(positions, chosen, springs) if springs.any() else positions
+
+    def _solve_loops(self, positions: Array, chosen: list[int]) -> Array:
         for _ in range(_STEPS):
             missing, matrix = self._measure(positions)
             if not len(missing) or np.abs(missing).max() < _CLOSE:
@@ -157,6 +189,26 @@ class Linkage:
             positions[chosen] += step
         return positions
 
+    def _relax(self, positions: Array, chosen: list[int], springs: Array) -> Array:
+        """Move joints by their springs in the directions that the equalities and the limits leave free."""
+        rest = self.model.qpos_spring[self.places[chosen]]
+        low, high = np.array([self.find_ends(joint) for joint in chosen]).T
+        for _ in range(_STEPS):
+            pull = springs * (rest - positions[chosen]) / springs.max()
+            matrix = self._measure(positions)[1][:, self.dofs[chosen]]
+            step = _project(pull, matrix, np.zeros(len(chosen), bool))
+            moved = positions[chosen] + step
+            stopped = (moved < low) & (positions[chosen] <= low + _CLOSE)
+            stopped |= (moved > high) & (positions[chosen] >= high - _CLOSE)
+            step = _project(pull, matrix, stopped)
+            longest = float(np.abs(step).max())
+            if longest < _CLOSE:
+                break
+            step *= min(1.0, _LONGEST / 2 / longest)
+            positions[chosen] = np.clip(positions[chosen] + step, low, high)
+            positions = self._solve_loops(positions, chosen)
+        return positions
+
     def _measure(self, positions: Array) -> tuple[Array, Array]:
         """Return by how much the equalities are missed, shape (rows,), and their derivatives, shape (rows, nv)."""
         self.data.qpos[self.places] = positions
@@ -164,6 +216,13 @@ class Linkage:
         rows = self.data.efc_type == int(self._mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         matrix = np.array(self.data.efc_J).reshape(-1, self.model.nv)
         return self.data.efc_pos[rows].copy(), matrix[rows]
+
+
+def _project(step: Array, matrix: Array, stopped: Array) -> Array:
+    """Return the part of a step of joints that the rows of a matrix do not see, and that moves none that is stopped."""
+    rows = np.concatenate([matrix, np.eye(len(step))[stopped]])
+    part: Array = step - np.linalg.pinv(rows, rcond=_RANK) @ (rows @ step)
+    return part
 
 
 def _find_rank(matrix: Array) -> int:

@@ -13,6 +13,7 @@ from rlctl.tasks.shapes import Array
 
 _FULL_FORCE = 0.1  # [rad or m], from the target at which a motor of the arm gives all its force
 _FULL_GRIP = 0.15  # of the gripper's way
+_SHORTEST = 1e-3  # [rad or m], way of a joint of the gripper
 _CLOSING = 0.3  # [s], in which the gripper closes
 _SAG = 0.02  # [rad or m], by which the arm's own weight moves a joint from its target, at most
 _SLOWEST, _FASTEST = 15.0, 80.0  # [rad/s], of a joint's oscillation without damping
@@ -37,9 +38,7 @@ class ChosenMotors:
     notes: list[str]  # what a user should know, without a full stop
 
 
-def choose_motors(
-    linkage: Linkage, gripper: Gripper, driven: Sequence[int], start: Array, block_mass: float
-) -> ChosenMotors:
+def choose_motors(linkage: Linkage, gripper: Gripper, start: Array, block_mass: float) -> ChosenMotors:
     """Return motors with which an arm holds itself, and whose gripper presses with `_GRIP` times a block's weight."""
     body, model = linkage.body, linkage.model
     inertia = _measure_inertia(linkage, start)
@@ -51,24 +50,22 @@ def choose_motors(
     notes = _list_notes(body.joint_names, arm, limits, needed, weight)
     is_known = (limits > 0) & (limits < _ENDLESS * needed)
     forces = np.where(is_known, limits, needed)
-    grip = _measure_grip(gripper, driven, block_mass)
-    for joint, force in zip(driven, grip, strict=True):
+    grip = _measure_grip(gripper, block_mass)
+    for joint, force in zip(gripper.joints, grip, strict=True):
         wanted = force + friction[joint]
         forces[joint] = min(wanted, limits[joint]) if limits[joint] > 0 else wanted
     armature = np.where(own > 0, own, forces / _MOTOR)
-    way = np.abs(gripper.open - gripper.closed)
-    for joint in gripper.joints:
-        # A force that does not crush the block moves the motor of a gripper fast enough only if that is light.
-        quick = forces[joint] * _CLOSING**2 / (4 * way[joint]) if joint in driven else 0.0
-        armature[joint] = min(armature[joint], quick)
+    # Heavy fingers crush a block before the small force of their motors stops them.
+    armature[gripper.joints] = np.minimum(armature, forces / _MOTOR)[gripper.joints]
+    way = _measure_way(gripper)
     moved = inertia - own + armature
     stiffness = np.maximum(forces / _FULL_FORCE, weight / _SAG)
-    for joint in driven:
+    for joint in gripper.joints:
         stiffness[joint] = forces[joint] / (_FULL_GRIP * way[joint])
     stiffness = np.minimum(stiffness, _FASTEST**2 * moved)
     stiffness[arm] = np.maximum(stiffness, _SLOWEST**2 * moved)[arm]
     damping = 2 * _DAMPING * np.sqrt(stiffness * moved)
-    for joint in driven:  # with its full force it closes fast enough
+    for joint in gripper.joints:  # with its full force it closes fast enough
         damping[joint] = min(damping[joint], forces[joint] * _CLOSING / way[joint])
     return ChosenMotors(stiffness, damping, armature, forces, notes)
 
@@ -99,11 +96,21 @@ def _measure_weight(linkage: Linkage) -> Array:
     return largest
 
 
-def _measure_grip(gripper: Gripper, driven: Sequence[int], block_mass: float) -> list[float]:
-    """Return the forces of motors that press on a block: their work is that of the fingers on it."""
+def _measure_way(gripper: Gripper) -> Array:
+    """Return how far each joint moves from open to closed [rad or m], which is not 0."""
+    way: Array = np.maximum(np.abs(gripper.open - gripper.closed), _SHORTEST)
+    return way
+
+
+def _measure_grip(gripper: Gripper, block_mass: float) -> list[float]:
+    """Return the forces of a gripper's motors on a block: their work is that of the fingers on it.
+
+    A joint that moves little gets little of it.
+    """
     force = _GRIP * _GRAVITY * block_mass
-    way = np.abs(gripper.open - gripper.closed)
-    return [force * gripper.opening / (len(driven) * float(way[joint])) for joint in driven]
+    way = _measure_way(gripper)[gripper.joints]
+    forces: list[float] = (force * gripper.opening * way / np.sum(way**2)).tolist()
+    return forces
 
 
 def _list_notes(names: Sequence[str], arm: Sequence[int], limits: Array, needed: Array, weight: Array) -> list[str]:
