@@ -1,14 +1,14 @@
 """`Motor`: a real motor with its gears and its position controller, as data that all parts of rlctl share.
 
-All values are those at the joint, in SI units, except the two of the electric motor itself, which a gear multiplies. The
-torque on the gears is
+All values are those at the joint, in SI units, but the torque constant: it is the electric motor's, before the gears.
+The torque at the joint, before friction, is
 
-    stiffness * (target - position) - damping * velocity + integral of the error     within the limits below
-    at most torque constant * gear ratio * current limit, and `max_torque_nm`
-    at most what the voltage drives through the resistance, against the back-EMF: it falls with speed
+    stiffness * (target - position) - damping * velocity + integral of the error     within these limits:
+    torque constant * gear ratio * current limit, and `max_torque_nm`
+    what the voltage drives through the resistance against the back-EMF, so less at higher speed
 
-and the friction resists it. A drive that regulates its voltage only, as hobby servos do, is also braked by the back-EMF.
-For sliding joints read m for rad, N for N m and kg for kg m^2.
+A drive that regulates its voltage only, as hobby servos do, is also braked by the back-EMF. For sliding joints read m
+for rad, N for N m and kg for kg m^2.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ Regulates = Literal["torque", "voltage"]
 class Motor:
     """A motor, its gears and its position controller. None: unknown, and without effect or as in the model file."""
 
-    stiffness_nm_per_rad: float
-    """Torque per position error, at the nominal voltage."""
+    stiffness_nm_per_rad: float | None = None
+    """Torque per position error, at the voltage `voltage_v`; `set_motors` needs it."""
     damping_nms_per_rad: float = 0.0
     """Torque per velocity that the controller adds; friction and back-EMF are not part of it."""
     integral_nm_per_rads: float = 0.0
@@ -40,7 +40,7 @@ class Motor:
     resistance_ohm: float | None = None
     """Of the electric motor's terminals."""
     voltage_v: float | None = None
-    """Supply; a stall torque and a no-load speed follow from it, the torque constant and the resistance."""
+    """Supply; stall torque and no-load speed follow from it, the torque constant and the resistance."""
     current_limit_a: float | None = None
     gear_ratio: float = 1.0
     """Turns of the motor per turn of the joint; 1 where the constants are already those at the joint."""
@@ -127,7 +127,9 @@ class Motor:
     def position_gain(self) -> float | None:
         """The gain in the controller's own unit (P of a servo) that gives this stiffness; None: unknown."""
         per_gain = self._stiffness_per_gain
-        return None if per_gain is None else self.stiffness_nm_per_rad / per_gain
+        if per_gain is None or self.stiffness_nm_per_rad is None:
+            return None
+        return self.stiffness_nm_per_rad / per_gain
 
     @property
     def _stiffness_per_gain(self) -> float | None:
@@ -142,6 +144,23 @@ class Motor:
         if per_gain is None:
             raise TaskError(f"motor {self.name!r}: the unit of its gain is unknown; set stiffness_nm_per_rad")
         return dataclasses.replace(self, stiffness_nm_per_rad=position_gain * per_gain)
+
+    @classmethod
+    def of_line(
+        cls, *, voltage_v: float, stall_torque_nm: float, no_load_speed_rad_per_s: float, **values: Any
+    ) -> Self:
+        """Return a motor whose torque falls on a straight line from standstill to the no-load speed.
+
+        Its constants are those that the line needs: they hold the losses of gears and friction too, so the friction of
+        the joint must not count them again. `values` are other fields.
+        """
+        constant = voltage_v / no_load_speed_rad_per_s
+        return cls(
+            torque_constant_nm_per_a=constant,
+            resistance_ohm=constant * voltage_v / stall_torque_nm,
+            voltage_v=voltage_v,
+            **values,
+        )
 
     def with_values(self, changes: Mapping[str, Any]) -> Self:
         """Return this motor with some fields replaced; raises `TaskError` for a field that is not there."""
