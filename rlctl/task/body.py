@@ -421,7 +421,8 @@ class Body:
 
         `commanded` are the fields of `Joints` that describe the action: `action_scale=0.25`, for example, or a number
         per joint; and `max_speed` and `max_torque`, where the task's motors have other limits than the model file.
-        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
+        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them. Those of real motors
+        are the speed without load and the torque at standstill.
         """
         chosen = self.find_joints(joints)
         low, high = self.joint_low[chosen], self.joint_high[chosen]
@@ -433,12 +434,31 @@ class Body:
         given: dict[str, Any] = {"max_speed": speed, "max_torque": torque, "default_positions": default_positions}
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
-            stiffness=() if self.drives is None else self.drives.stiffness[chosen].tolist(),
-            damping=() if self.drives is None else self.drives.damping[chosen].tolist(),
+            **self._describe_drives(chosen),
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
             **(given | commanded),
         )
+
+    def _describe_drives(self, joints: list[int]) -> dict[str, list[float]]:
+        """Return what `Joints` has of springs, dampers and motors; what is not known of all joints is left out."""
+        found: dict[str, list[float | None]] = {
+            name: [] for name in ("stiffness", "damping", "drive_gain", "drive_voltage")
+        }
+        for joint in joints:
+            motor = self.motors.get(self.joint_names[joint])
+            if motor is not None:
+                values = motor.stiffness_nm_per_rad, motor.damping_nms_per_rad, motor.position_gain, motor.voltage_v
+            elif self.drives is not None:
+                values = float(self.drives.stiffness[joint]), float(self.drives.damping[joint]), None, None
+            else:
+                values = None, None, None, None
+            for name, value in zip(found, values, strict=True):
+                found[name].append(value)
+        if None in found["drive_gain"]:
+            found["drive_voltage"] = [None]  # a voltage says something about a gain only
+        known = {name: [value for value in values if value is not None] for name, values in found.items()}
+        return {name: values for name, values in known.items() if len(values) == len(joints)}
 
     def _spread_motors(self, motors: Motors, joints: Sequence[str], changes: Mapping[str, Any]) -> dict[int, Motor]:
         """Return motors by joint; raises `TaskError` where their number, names or values are wrong."""

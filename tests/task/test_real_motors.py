@@ -6,10 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rlctl.engine import MUJOCO
 from rlctl.errors import TaskError, UsageError
+from rlctl.task import BatchTask, Box, Event, events
+from rlctl.task.events import EventSettings
 from rlctl.task.motors import Motor
 from rlctl.task.mujoco.sim import MujocoSim
+from rlctl.task.named_motors import TABLE, find_motor
 from rlctl.task.pybullet.sim import PybulletSim
+from rlctl.task.worlds import TaskWorlds
 
 pytest.importorskip("mujoco")
 GRAVITY = 9.81
@@ -272,3 +277,99 @@ def test_what_a_motor_cannot_do(pendulum):
         body.set_motor_delay(0.01)
     with pytest.raises(TaskError, match="its speed follows from its voltage"):
         body.drive_to(np.zeros(1), max_speed=1.0)
+
+
+def test_joints_have_the_gain_that_is_written_into_the_servo(pendulum):
+    _, body = pendulum("sts3215")
+    joints = body.describe_joints(["hinge"])
+    assert joints.drive_gain == pytest.approx((32.0,))
+    assert joints.drive_voltage == (7.4,)
+    # Open Duck Mini writes the same two into its model: 17.8 N m/rad and 3.35 N m.
+    assert joints.stiffness == pytest.approx((17.8,), rel=1e-3)
+    assert joints.max_torque == pytest.approx((3.35,), rel=1e-3)
+    _, weaker = pendulum(find_motor("sts3215").at_gain(16.0))
+    assert weaker.describe_joints(["hinge"]).stiffness == pytest.approx((8.9,), rel=1e-3)
+
+
+def test_a_drive_without_a_gain_of_its_own_has_neither(pendulum):
+    _, body = pendulum(SERVO)
+    joints = body.describe_joints(["hinge"])
+    assert (joints.stiffness, joints.drive_gain, joints.drive_voltage) == ((20.0,), (), ())
+
+
+def test_a_motor_whose_stiffness_nobody_knows(pendulum):
+    with pytest.raises(TaskError, match="motor 'mg90s': its stiffness is unknown; pass stiffness_nm_per_rad="):
+        pendulum("mg90s")
+    _, body = pendulum("mg90s", stiffness_nm_per_rad=2.0)
+    assert body.motors["hinge"].stiffness_nm_per_rad == 2.0
+
+
+def test_a_name_that_is_not_in_the_table(pendulum):
+    with pytest.raises(TaskError, match=r"no motor .sts3251.\. Did you mean .sts3215."):
+        pendulum("sts3251")
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_motors_of_the_table(pendulum, name):
+    entry = TABLE[name]
+    assert entry.source
+    assert entry.unknown
+    changes = {} if entry.motor.stiffness_nm_per_rad else {"stiffness_nm_per_rad": 1.0}
+    sim, body = pendulum(name, gravity=0.0, armature_kgm2=entry.motor.armature_kgm2 or 0.01, **changes)
+    play(sim, body, 1000.0, 150)
+    speed = body.motors["hinge"].no_load_speed_rad_per_s
+    assert 0.7 * speed < body.joint_velocities[0] < 1.001 * speed  # friction makes it slower
+
+
+class Pendulums(BatchTask):
+    """Pendulums that are told to hold still, with every event of motors."""
+
+    control_dt, substeps, solver_iterations, episode_s = 0.02, 4, 3, 1.0
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    reward_weights = {"nothing": 0.0}
+    events = {
+        "friction": Event("reset", events.motor_friction, body="arm", coulomb_nm=(0.0, 0.3)),
+        "backlash": Event("reset", events.backlash, body="arm", backlash_rad=(0.0, 0.05)),
+        "voltage": Event("reset", events.voltage, body="arm", voltage_v=(9.0, 12.0)),
+        "constant": Event("reset", events.torque_constant, body="arm", factor=(0.8, 1.2)),
+        "bias": Event("reset", events.motor_bias, body="arm", bias_rad=(-0.1, 0.1)),
+        "delay": Event("reset", events.motor_delay, body="arm", delay_s=(0.0, 0.01)),
+    }
+    model = ""
+
+    def build(self, sim):
+        self.arm = sim.load("arm", self.model, fixed=True)
+        self.arm.set_motors(FULL)
+
+    def reset(self, rng, worlds):
+        self.arm.set_joints(np.zeros((len(worlds), 1)), worlds=worlds)
+
+    def act(self, action):
+        self.arm.drive_to(action.astype(float))
+
+    def observe(self):
+        return {"joints": self.arm.joint_positions}
+
+    def rewards(self, action):
+        return {"nothing": np.zeros(self.worlds)}
+
+
+def test_events_change_each_world_and_the_critic_sees_them(tmp_path):
+    (tmp_path / "pendulum.xml").write_text(PENDULUM)
+    Pendulums.model = tmp_path / "pendulum.xml"
+    worlds = TaskWorlds(Pendulums(), count=3, sim=MUJOCO, events=EventSettings(randomize=True))
+    with closing(worlds):
+        worlds.show_critic(task=True, events=True)
+        rows = worlds.reset(np.arange(3), np.array([1, 2, 3]))
+        assert rows.shape[0] == 3
+        model = worlds.sim.world
+        drawn = worlds.drawn
+        for world in range(3):
+            assert model.model("dof_frictionloss")[world, 0] == drawn[world]["friction"]["hinge"]
+            assert model.model("jnt_range")[world, 1, 1] == pytest.approx(drawn[world]["backlash"]["hinge"] / 2)
+            assert model.model("actuator_gainprm")[world, 0, 7] == drawn[world]["voltage"]["voltage_v"]
+            assert model.model("actuator_gainprm")[world, 0, 1] == 0.5 * drawn[world]["constant"]["hinge"]
+            assert model.model("encoder bias")[world, 0] == drawn[world]["bias"]["hinge"]
+        seen = worlds.observe_privileged(np.arange(3))
+        assert seen.shape == (3, 6)
+        assert np.unique(seen[:, 0]).size == 3
