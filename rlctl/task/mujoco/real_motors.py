@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 RESISTANCE, CONSTANT, STIFFNESS, INTEGRAL, DAMPING, VOLTAGE = 0, 1, 4, 5, 6, 7
 _FRICTION = (0.999, 0.999, 0.001, 0.5, 2)  # impedance: a held joint creeps by 1e-4 rad/s, by 1e-2 with MuJoCo's default
 _STOP = (0.99, 0.999, 0.001, 0.5, 2)  # of the ends of the play
+_ITERATIONS = 20
+"""Of the solver, at least, for joints with play: a quadruped's explode with 5, and stand with 8."""
 _HISTORY_HEADER = 2  # numbers before the time stamps of a history of controls
 
 
@@ -40,6 +42,7 @@ def add_motors(mujoco: Any, spec: Any, body: str, motors: Mapping[str, Motor]) -
         if motor.armature_kgm2 is not None:
             joint.armature = motor.armature_kgm2  # before the compilation, which scales the stops of the play by it
         if motor.backlash_rad > 0:
+            spec.option.iterations = max(spec.option.iterations, _ITERATIONS)
             _add_play(mujoco, spec, body, name, timestep)
         actuator = spec.actuator(f"{body}/motor {name}")
         inputs, largest = mujoco.mjtCtrlInput.mjINPUT_FF, 0.0
