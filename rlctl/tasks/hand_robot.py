@@ -355,7 +355,7 @@ def _write_point(values: Sequence[float] | Array) -> SourceText:
 
 
 def _describe_motors(hand: _Hand) -> dict[str, str]:
-    """Return texts of the real motors that were asked for; a value that their table does not have is that of a spring."""
+    """Return texts of the real motors that were asked for; values that their table does not have are of springs."""
     if hand.asked is None:
         return {}
     chosen = hand.gripper.arm
