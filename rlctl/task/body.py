@@ -355,7 +355,7 @@ class Body:
     def set_motor_delay(self, delay_s: float, joints: Sequence[str] = ()) -> None:
         """Set the time from a command to its torque [s], until the next reset, rounded to physics steps.
 
-        Raises `TaskError` for a longer one than `set_motors` has set.
+        Raises `TaskError` for more than twice the one that `set_motors` has set.
         """
         self._refuse("set_motor_delay")
 

@@ -373,3 +373,14 @@ def test_events_change_each_world_and_the_critic_sees_them(tmp_path):
         seen = worlds.observe_privileged(np.arange(3))
         assert seen.shape == (3, 6)
         assert np.unique(seen[:, 0]).size == 3
+
+
+def test_a_delay_that_events_make_longer(pendulum):
+    sim, body = pendulum(IDEAL, gravity=0.0, delay_s=2 * DT)
+    sim.world.substeps = 1
+    body.set_motor_delay(4 * DT)
+    positions = play(sim, body, 0.3, 6)[:, 0]
+    assert (positions[:4] == 0.0).all()
+    assert (positions[4:] > 0.0).all()
+    with pytest.raises(TaskError, match=r"set_motors made room for 0.02 s: call set_motors\(.., delay_s=0.03\)"):
+        body.set_motor_delay(6 * DT)

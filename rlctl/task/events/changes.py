@@ -140,7 +140,7 @@ def motor_bias(sim: Sim, rng: Rng, *, body: str, bias_rad: Range, joints: Sequen
 def motor_delay(sim: Sim, rng: Rng, *, body: str, delay_s: NotNegative, joints: Sequence[str] = ()) -> Drawn:
     """Set the time from a command to the torque of the motors of `joints`, or of all [s], to whole physics steps.
 
-    They need `set_motors(.., delay_s=0.02)` in `build`, with the longest delay.
+    It may be up to twice that of `set_motors(.., delay_s=0.02)` in `build`.
     """
     drawn = float(rng.uniform(*delay_s))
     sim.body(body).set_motor_delay(drawn, joints)

@@ -25,6 +25,7 @@ _FRICTION = (0.999, 0.999, 0.001, 0.5, 2)  # impedance: a held joint creeps by 1
 _STOP = (0.99, 0.999, 0.001, 0.5, 2)  # of the ends of the play
 _ITERATIONS = 20
 """Of the solver, at least, for joints with play: a quadruped's explode with 5, and stand with 8."""
+_ROOM = 2  # times the delay, for events that make it longer
 _HISTORY_HEADER = 2  # numbers before the time stamps of a history of controls
 
 
@@ -59,7 +60,7 @@ def add_motors(mujoco: Any, spec: Any, body: str, motors: Mapping[str, Motor]) -
         actuator.forcelimited = True
         samples = count_samples(motor.delay_s, timestep)
         if samples:
-            actuator.nsample, actuator.delay = samples, delay_of(samples, timestep)
+            actuator.nsample, actuator.delay = _ROOM * samples, delay_of(samples, timestep)
 
 
 def _add_play(mujoco: Any, spec: Any, body: str, name: str, timestep: float) -> None:
