@@ -129,7 +129,7 @@ class Motor:
         per_gain = self._stiffness_per_gain
         if per_gain is None or self.stiffness_nm_per_rad is None:
             return None
-        return self.stiffness_nm_per_rad / per_gain
+        return float(f"{self.stiffness_nm_per_rad / per_gain:.9g}")  # a register of a servo is a whole number
 
     @property
     def _stiffness_per_gain(self) -> float | None:
