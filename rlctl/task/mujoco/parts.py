@@ -14,7 +14,7 @@ WORLD = "world"
 """MuJoCo's name of what all bodies are in; an MJCF file may give it shapes, such as a floor."""
 
 
-class Play(NamedTuple):
+class JointPlay(NamedTuple):
     """Numbers of the joint that is the play of another: the joint, and its elements of `qpos` and `qvel`."""
 
     joint: int
@@ -56,7 +56,7 @@ class Parts:
         self.drives: tuple[Array, Array, Array | None] | None = None
         self.real: dict[int, Motor] = {}
         """Motors of `set_motors`, by joint."""
-        self.plays: dict[int, Play] = {}
+        self.plays: dict[int, JointPlay] = {}
         """The joints in series that are the play of others, by joint."""
         self.has_bias = False
         """Whether an encoder has read something else than the joint's position."""
@@ -92,7 +92,7 @@ class Parts:
         self.plays = {}
         for joint, name in enumerate(self.joint_names):
             if (number := _find_joint(model, name_play(self.name, name))) is not None:
-                self.plays[joint] = Play(number, int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number]))
+                self.plays[joint] = JointPlay(number, int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number]))
         self.geoms = [model.geom(f"{prefix}{number}").id for number, _ in self.collision_geoms]
         """Numbers of the geoms that collide."""
         self.free: tuple[int, int] | None = None  # where the state of a free base begins, in qpos and qvel
