@@ -249,8 +249,9 @@ class Body:
     def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
         """Give joints real motors, with friction, voltage, backlash and delay. Call it in `build`; MuJoCo only.
 
-        `motors` is a `Motor` or the name of one in `rlctl.task.named_motors`, for all joints or one per joint;
-        `changes` replace values of all of them, each one number or one per joint: `backlash_rad=0.02`. From then on
+        `motors` is a `Motor` or the name of one in `rlctl.task.named_motors`, for all joints or one per joint, or such
+        motors by the names of joints, as `rlctl identify` writes them. `changes` replace values of all of them, each
+        one number or one per joint: `backlash_rad=0.02`. From then on
         `drive_to` sets the targets of the motors' controllers, and what a motor's limits allow is what it gives.
         Afterwards `joint_positions` are what encoders read: those of the motors, without the play behind them, plus
         their bias. `set_joints` takes the same. A joint's other motors stay as `set_drives` has made them.
@@ -462,18 +463,26 @@ class Body:
 
     def _spread_motors(self, motors: Motors, joints: Sequence[str], changes: Mapping[str, Any]) -> dict[int, Motor]:
         """Return motors by joint; raises `TaskError` where their number, names or values are wrong."""
+        if isinstance(motors, Mapping):
+            if joints:
+                raise TaskError("set_motors: motors by joint and joints= exclude each other")
+            joints, listed = list(motors), list(motors.values())
         chosen = self.find_joints(joints)
-        listed = [motors] * len(chosen) if isinstance(motors, Motor | str) else list(motors)
+        if isinstance(motors, Motor | str):
+            listed = [motors] * len(chosen)
+        elif not isinstance(motors, Mapping):
+            listed = list(motors)
         if len(listed) != len(chosen):
             raise TaskError(f"{self.file.name}: {len(listed)} motors for {len(chosen)} joints")
         values = {name: _list_values(name, value, len(chosen)) for name, value in changes.items()}
         result = {}
-        for place, (joint, motor) in enumerate(zip(chosen, listed, strict=True)):
-            own = find_motor(motor).with_values({name: value[place] for name, value in values.items()})
-            if own.stiffness_nm_per_rad is None:
-                named = f" {own.name!r}" if own.name else ""
+        for place, (joint, given) in enumerate(zip(chosen, listed, strict=True)):
+            motor = Motor().with_values(given) if isinstance(given, Mapping) else find_motor(given)
+            motor = motor.with_values({name: value[place] for name, value in values.items()})
+            if motor.stiffness_nm_per_rad is None:
+                named = f" {motor.name!r}" if motor.name else ""
                 raise TaskError(f"motor{named}: its stiffness is unknown; pass stiffness_nm_per_rad=")
-            result[joint] = own
+            result[joint] = motor
         return result
 
     def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:

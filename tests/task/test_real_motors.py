@@ -384,3 +384,14 @@ def test_a_delay_that_events_make_longer(pendulum):
     assert (positions[4:] > 0.0).all()
     with pytest.raises(TaskError, match=r"set_motors made room for 0.02 s: call set_motors\(.., delay_s=0.03\)"):
         body.set_motor_delay(6 * DT)
+
+
+def test_motors_by_joint(pendulum):
+    _, body = pendulum({"hinge": {"stiffness_nm_per_rad": 5.0, "coulomb_friction_nm": 0.1}}, armature_kgm2=0.02)
+    assert body.motors == {"hinge": Motor(stiffness_nm_per_rad=5.0, coulomb_friction_nm=0.1, armature_kgm2=0.02)}
+    with pytest.raises(TaskError, match=r"no joint 'hinges'\. Did you mean 'hinge'"):
+        pendulum({"hinges": SERVO})
+    with pytest.raises(TaskError, match="a motor has no value 'stiffness'"):
+        pendulum({"hinge": {"stiffness": 5.0}})
+    with pytest.raises(TaskError, match="motors by joint and joints= exclude each other"):
+        pendulum({"hinge": SERVO}, joints=["hinge"])

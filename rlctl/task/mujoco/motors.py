@@ -129,10 +129,23 @@ class MujocoMotors(Body):
 
     def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
         chosen = self._spread_motors(motors, joints, changes)
+        self._check_armature(chosen)
         self.parts.real |= chosen
         named = {self.joint_names[joint]: motor for joint, motor in chosen.items()}
         self._sim.add_motors(self.name, named)
         self._write_motors(chosen)
+
+    def _check_armature(self, motors: Mapping[int, Motor]) -> None:
+        """Raise `TaskError` for play without an inertia of the motor, which moves in it."""
+        model = self._sim.model
+        own = model.dof_armature[self.parts.velocities]
+        for joint, motor in motors.items():
+            armature = own[joint] if motor.armature_kgm2 is None else motor.armature_kgm2
+            if motor.backlash_rad > 0 and armature <= 0:
+                raise TaskError(
+                    f"{self.file.name}: joint {self.joint_names[joint]!r} has backlash and no armature; give its "
+                    "motor armature_kgm2, the inertia of rotor and gears"
+                )
 
     def _write_motors(self, motors: Mapping[int, Motor]) -> None:
         """Write what a compilation takes from the model before it."""
@@ -149,11 +162,6 @@ class MujocoMotors(Body):
                 if value is not None:
                     getattr(model, name)[dofs[joint]] = value
             if motor.backlash_rad > 0:
-                if model.dof_armature[dofs[joint]] <= 0:
-                    raise TaskError(
-                        f"{self.file.name}: joint {self.joint_names[joint]!r} has backlash and no armature; give its "
-                        "motor armature_kgm2, the inertia of rotor and gears"
-                    )
                 half = motor.backlash_rad / 2
                 model.jnt_range[self.parts.plays[joint].joint] = -half, half
             encoder_bias = self._sim.world.extra["encoder bias"]
