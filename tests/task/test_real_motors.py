@@ -1,7 +1,7 @@
 """`set_motors`: what a real motor does, on a pendulum and on a wheel whose answers are known by hand."""
 
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.named_motors import TABLE, find_motor
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.worlds import TaskWorlds
+from rlctl_locomotion.walk import Walk
 
 pytest.importorskip("mujoco")
 GRAVITY = 9.81
@@ -395,3 +396,42 @@ def test_motors_by_joint(pendulum):
         pendulum({"hinge": {"stiffness": 5.0}})
     with pytest.raises(TaskError, match="motors by joint and joints= exclude each other"):
         pendulum({"hinge": SERVO}, joints=["hinge"])
+
+
+@dataclass
+class MotorWalk(Walk):
+    """The walking A1 with the torque and speed of its motors, friction, play and delay; its events vary them all."""
+
+    events = {
+        "friction": Event("reset", events.motor_friction, body="robot", coulomb_nm=(0.0, 1.0)),
+        "backlash": Event("reset", events.backlash, body="robot", backlash_rad=(0.0, 0.05)),
+        "voltage": Event("reset", events.voltage, body="robot", voltage_v=(0.6, 1.0)),
+        "bias": Event("reset", events.motor_bias, body="robot", bias_rad=(-0.05, 0.05)),
+        "delay": Event("reset", events.motor_delay, body="robot", delay_s=(0.0, 0.03)),
+    }
+
+    def build(self, sim):
+        super().build(sim)
+        self.body.set_motors(
+            "unitree-a1",
+            stiffness_nm_per_rad=35.0,
+            damping_nms_per_rad=0.7,
+            armature_kgm2=0.01,
+            backlash_rad=0.02,
+            delay_s=0.03,
+        )
+
+
+def walk(seeds, actions):
+    """Return the observations of worlds with these seeds."""
+    worlds = TaskWorlds(MotorWalk(), len(seeds), sim=MUJOCO, events=EventSettings(randomize=True))
+    with closing(worlds):
+        rows = [worlds.reset(np.arange(len(seeds)), seeds)]
+        return np.array(rows + [worlds.step(action).observation for action in actions])
+
+
+def test_a_robot_on_the_ground_is_a_row_of_a_batch_to_the_bit():
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 2, 12)).astype(np.float32)
+    together = walk([5, 6], actions)
+    for world, seed in enumerate([5, 6]):
+        assert np.array_equal(walk([seed], actions[:, world : world + 1])[:, 0], together[:, world])
