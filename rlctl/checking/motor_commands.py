@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from rlctl.checking.world_logs import LoggedWorld
-from rlctl.checking.worlds import Array, Motor
+from rlctl.checking.worlds import Array, JointActuator
 
 FEWEST_ROWS = 40
 SAME = 1e-5  # relative; a command is a function of something if it differs by no more
@@ -15,7 +15,7 @@ SAME = 1e-5  # relative; a command is a function of something if it differs by n
 class CommandSpan:
     """The commands that all actions of the space give a motor: from `low` to `high`, by one element of the action."""
 
-    motor: Motor
+    motor: JointActuator
     number: int
     element: int
     low: float
@@ -26,7 +26,7 @@ class CommandSpan:
 class MotorCommands:
     """What was written for the motors of a world, step by step."""
 
-    motors: tuple[Motor, ...]
+    motors: tuple[JointActuator, ...]
     values: Array  # Shape (n, motors)
     actions: Array  # Shape (n, k)
     low: Array  # Of the action. Shape (k,)

@@ -7,7 +7,7 @@ import numpy as np
 
 from rlctl.checking.motor_commands import CommandSpan
 from rlctl.checking.world_logs import LoggedWorld
-from rlctl.checking.worlds import JOINTS, Array, Motor, MotorTarget
+from rlctl.checking.worlds import JOINTS, Array, JointActuator, MotorTarget
 
 APART = 0.2  # of a target and its own joint's position [rad], [m]
 DEGREE = math.pi / 180
@@ -33,7 +33,7 @@ def read_first_targets(world: LoggedWorld) -> Iterator[tuple[str, list[str], Arr
             yield body.name, names, rows.mean(axis=0), targets, log.states[0][i][columns], error
 
 
-def covers(span: CommandSpan, motor: Motor, factor: float = 1.0) -> bool:
+def covers(span: CommandSpan, motor: JointActuator, factor: float = 1.0) -> bool:
     """Say whether a span is the limits of a motor's joint times a factor."""
     joint = motor.joint
     ends = np.array([joint.low, joint.high]) * factor * motor.gear

@@ -12,7 +12,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_worlds import library
 from rlctl.checking.rule import list_names
-from rlctl.checking.worlds import Array, Joint, Motor
+from rlctl.checking.worlds import Array, Joint, JointActuator
 from rlctl.environments.info import find_mujoco
 
 
@@ -33,7 +33,7 @@ class PlayedMotors:
 class MotorTrial:
     """Plays episodes in which joints are moved."""
 
-    def __init__(self, instance: Instance, calls: MujocoCalls, motors: Sequence[Motor]) -> None:
+    def __init__(self, instance: Instance, calls: MujocoCalls, motors: Sequence[JointActuator]) -> None:
         self.instance, self.motors, self._calls = instance, motors, calls
         self.joints: list[Joint] = list({motor.joint.index: motor.joint for motor in motors}.values())
         numbers = [joint.index for joint in self.joints]

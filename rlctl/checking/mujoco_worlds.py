@@ -19,10 +19,10 @@ from rlctl.checking.worlds import (
     MOST_STEPS,
     Array,
     Joint,
+    JointActuator,
     JointKey,
     Jump,
     Link,
-    Motor,
     MotorTarget,
     Pair,
     Poses,
@@ -110,7 +110,7 @@ def _joint(model: Any, joint: int) -> Joint:
     return Joint(joint, name, int(model.jnt_type[joint]) != SLIDE, float(low), float(high))
 
 
-def _motor(model: Any, actuator: int) -> Motor | None:
+def _motor(model: Any, actuator: int) -> JointActuator | None:
     joint = int(model.actuator_trnid[actuator, 0])
     if int(model.actuator_trntype[actuator]) not in ON_JOINT or int(model.jnt_type[joint]) < SLIDE:
         return None
@@ -121,7 +121,7 @@ def _motor(model: Any, actuator: int) -> Motor | None:
     low, high = model.actuator_ctrlrange[actuator] if has_range else (-math.inf, math.inf)
     name = model.actuator(actuator).name or f"actuator {actuator}"
     root, gear = int(model.body_rootid[model.jnt_bodyid[joint]]), float(model.actuator_gear[actuator, 0]) or 1.0
-    return Motor(name, _joint(model, joint), root, holds, gear, float(low), float(high))
+    return JointActuator(name, _joint(model, joint), root, holds, gear, float(low), float(high))
 
 
 class MujocoStateReader:

@@ -57,7 +57,7 @@ class WorldBody:
 
 
 @dataclasses.dataclass(frozen=True)
-class Motor:
+class JointActuator:
     """An actuator of MuJoCo that moves a joint."""
 
     name: str
@@ -76,7 +76,9 @@ class World:
     client: int  # Of PyBullet; 0 in MuJoCo
     bodies: tuple[WorldBody, ...]
     engine: str = "PyBullet"
-    motors: tuple[Motor, ...] = ()  # In MuJoCo, the actuators in the order of `ctrl`; all move a joint, or it is empty
+    motors: tuple[
+        JointActuator, ...
+    ] = ()  # In MuJoCo, the actuators in the order of `ctrl`; all move a joint, or it is empty
 
     @property
     def key(self) -> tuple[Any, ...]:

@@ -195,13 +195,30 @@ def new_task(
     tip: Annotated[
         str | None, Option("Link of --model whose origin is between the fingers, if it is not found.", metavar="FRAME")
     ] = None,
+    motors: Annotated[
+        str | None, Option("Real motors of --model by name, such as sts3215; MuJoCo only.", metavar="NAME")
+    ] = None,
+    backlash: Annotated[
+        str | None, Option("Play of the gears of --motors, from end to end: 1deg or 0.02rad.", metavar="ANGLE")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Create a starter plugin in a folder NAME: a reach, walk or pick task that trains as it is, its recipe, tests."""
     from rlctl.tasks.new import create, show
 
     hand = [name for name, asked in (("pick", pick), ("place", place), ("push", push)) if asked]
-    show(create(name, model=model, link=link, walk=walk, hand=hand, gripper=gripper, tip=tip), json)
+    plugin = create(
+        name,
+        model=model,
+        link=link,
+        walk=walk,
+        hand=hand,
+        gripper=gripper,
+        tip=tip,
+        motors=motors,
+        backlash=backlash,
+    )
+    show(plugin, json)
 
 
 @command

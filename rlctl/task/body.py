@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, NoReturn
 
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.joints import Joints
+from rlctl.task.motors import Motor, Motors
+from rlctl.task.named_motors import find_motor
 from rlctl.task.rotations import roll_pitch_yaw
 
 Array = NDArray[np.float64]
@@ -72,9 +75,9 @@ class Body:
     """Joint limits [rad or m], infinite where the model file has none; shape (joints,), as `joint_high`."""
     joint_high: Array
     joint_max_force: Array
-    """Torque or force limit in the model file [N m or N], shape (joints,); 0 where the file has none."""
+    """Torque or force limit in the model file, or of `set_motors` [N m or N], shape (joints,); 0: none is known."""
     joint_max_speed: Array
-    """Velocity limit in the model file [rad/s or m/s], shape (joints,); 0 where the file has none."""
+    """Velocity limit in the model file, or of `set_motors` [rad/s or m/s], shape (joints,); 0: none is known."""
     actuator_names: Sequence[str] = ()
     """Names of the actuators that an MJCF file has, for `set_controls`; PyBullet does not read them."""
     sensor_names: Sequence[str] = ()
@@ -83,6 +86,8 @@ class Body:
     """Points of rough ground [m], world frame, shape (along x, along y, 3); None for any other body."""
     drives: Drives | None
     """What `set_drives` set; None: `drive_to` uses its `gain`."""
+    motors: Mapping[str, Motor] = MappingProxyType({})
+    """What `set_motors` set, by joint."""
     _chosen: set[int]  # joints whose motors the task has set or disabled
 
     def _refuse(self, what: str) -> NoReturn:
@@ -241,6 +246,21 @@ class Body:
         """
         self._refuse("set_drives")
 
+    def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
+        """Give joints real motors, with friction, voltage, backlash and delay. Call it in `build`; MuJoCo only.
+
+        `motors` is a `Motor` or the name of one in `rlctl.task.named_motors`, for all joints or one per joint, or such
+        motors by the names of joints, as `rlctl identify` writes them. `changes` replace values of all of them, each
+        one number or one per joint: `backlash_rad=0.02`. From then on
+        `drive_to` sets the targets of the motors' controllers, and what a motor's limits allow is what it gives.
+        Afterwards `joint_positions` are what encoders read: those of the motors, without the play behind them, plus
+        their bias. `set_joints` takes the same. A joint's other motors stay as `set_drives` has made them.
+        """
+        raise UsageError(
+            "set_motors: real motors (friction, voltage, backlash, delay) are in MuJoCo only: use --sim mujoco, or "
+            "set_drives, which both engines have"
+        )
+
     def drive_to(
         self,
         positions: Array,
@@ -300,6 +320,45 @@ class Body:
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
         """Scale the force of the joints' motors by `factor`, until the next reset."""
         raise NotImplementedError
+
+    def set_joint_friction(self, friction: float | Array, joints: Sequence[str] = ()) -> None:
+        """Set the dry friction of joints [N m or N], until the next reset: one number, or one per joint."""
+        self._refuse("set_joint_friction")
+
+    def set_backlash(self, backlash: float | Array, joints: Sequence[str] = ()) -> None:
+        """Set the play of joints [rad or m], from end to end, until the next reset: one number, or one per joint.
+
+        Raises `TaskError` for joints to which `set_motors` has given no play.
+        """
+        self._refuse("set_backlash")
+
+    def set_voltage(self, voltage: float | Array, joints: Sequence[str] = ()) -> None:
+        """Set the supply of motors [V], until the next reset: one number, or one per joint.
+
+        A servo that regulates its voltage is also less stiff with less of it.
+        """
+        self._refuse("set_voltage")
+
+    def scale_torque_constant(self, factor: float | Array, joints: Sequence[str] = ()) -> None:
+        """Set the torque constant of motors to `factor` times that of the built world, until the next reset.
+
+        Their controllers do not know of it: they are stiffer by the same factor.
+        """
+        self._refuse("scale_torque_constant")
+
+    def set_encoder_bias(self, bias: float | Array, joints: Sequence[str] = ()) -> None:
+        """Set what encoders read where their joints are at 0 [rad or m], until the next reset.
+
+        `joint_positions`, `drive_to` and `set_joints` have the positions of the encoders.
+        """
+        self._refuse("set_encoder_bias")
+
+    def set_motor_delay(self, delay_s: float, joints: Sequence[str] = ()) -> None:
+        """Set the time from a command to its torque [s], until the next reset, rounded to physics steps.
+
+        Raises `TaskError` for more than twice the one that `set_motors` has set.
+        """
+        self._refuse("set_motor_delay")
 
     def lock_joints(self, joints: Sequence[str] = ()) -> None:
         """Hold joints where they are, against motors and loads, until the next reset: as a jammed gear does.
@@ -363,7 +422,8 @@ class Body:
 
         `commanded` are the fields of `Joints` that describe the action: `action_scale=0.25`, for example, or a number
         per joint; and `max_speed` and `max_torque`, where the task's motors have other limits than the model file.
-        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them.
+        If a limit is missing, 0 or infinite for one of the joints, it is left out for all of them. Those of real motors
+        are the speed without load and the torque at standstill.
         """
         chosen = self.find_joints(joints)
         low, high = self.joint_low[chosen], self.joint_high[chosen]
@@ -375,12 +435,55 @@ class Body:
         given: dict[str, Any] = {"max_speed": speed, "max_torque": torque, "default_positions": default_positions}
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
-            stiffness=() if self.drives is None else self.drives.stiffness[chosen].tolist(),
-            damping=() if self.drives is None else self.drives.damping[chosen].tolist(),
+            **self._describe_drives(chosen),
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
             **(given | commanded),
         )
+
+    def _describe_drives(self, joints: list[int]) -> dict[str, list[float]]:
+        """Return what `Joints` has of springs, dampers and motors; what is not known of all joints is left out."""
+        found: dict[str, list[float | None]] = {
+            name: [] for name in ("stiffness", "damping", "drive_gain", "drive_voltage")
+        }
+        for joint in joints:
+            motor = self.motors.get(self.joint_names[joint])
+            if motor is not None:
+                values = motor.stiffness_nm_per_rad, motor.damping_nms_per_rad, motor.position_gain, motor.voltage_v
+            elif self.drives is not None:
+                values = float(self.drives.stiffness[joint]), float(self.drives.damping[joint]), None, None
+            else:
+                values = None, None, None, None
+            for name, value in zip(found, values, strict=True):
+                found[name].append(value)
+        if None in found["drive_gain"]:
+            found["drive_voltage"] = [None]  # a voltage says something about a gain only
+        known = {name: [value for value in values if value is not None] for name, values in found.items()}
+        return {name: values for name, values in known.items() if len(values) == len(joints)}
+
+    def _spread_motors(self, motors: Motors, joints: Sequence[str], changes: Mapping[str, Any]) -> dict[int, Motor]:
+        """Return motors by joint; raises `TaskError` where their number, names or values are wrong."""
+        if isinstance(motors, Mapping):
+            if joints:
+                raise TaskError("set_motors: motors by joint and joints= exclude each other")
+            joints, listed = list(motors), list(motors.values())
+        chosen = self.find_joints(joints)
+        if isinstance(motors, Motor | str):
+            listed = [motors] * len(chosen)
+        elif not isinstance(motors, Mapping):
+            listed = list(motors)
+        if len(listed) != len(chosen):
+            raise TaskError(f"{self.file.name}: {len(listed)} motors for {len(chosen)} joints")
+        values = {name: _list_values(name, value, len(chosen)) for name, value in changes.items()}
+        result = {}
+        for place, (joint, given) in enumerate(zip(chosen, listed, strict=True)):
+            motor = Motor().with_values(given) if isinstance(given, Mapping) else find_motor(given)
+            motor = motor.with_values({name: value[place] for name, value in values.items()})
+            if motor.stiffness_nm_per_rad is None:
+                named = f" {motor.name!r}" if motor.name else ""
+                raise TaskError(f"motor{named}: its stiffness is unknown; pass stiffness_nm_per_rad=")
+            result[joint] = motor
+        return result
 
     def _find_force_limits(self, joints: list[int], max_force: Limit) -> Array:
         """Return the force limits of motors, shape (joints,); raises `TaskError` if task and file have none."""
@@ -407,3 +510,14 @@ class Body:
         if array.shape not in ((), (count,)) or not (array >= 0).all() or not math.isfinite(array.sum()):
             raise TaskError(f"{self.file.name}: {name} {value} is not one number, or one for each of {count} joints")
         return np.broadcast_to(array, count).copy()
+
+
+def _list_values(name: str, value: Any, count: int) -> list[Any]:
+    """Return one value, or one per joint, as a list of one per joint."""
+    if isinstance(value, str) or np.ndim(value) == 0:
+        return [value] * count
+    values = np.asarray(value).tolist()
+    if len(values) != count:
+        raise TaskError(f"motors: {name} has {len(values)} values for {count} joints")
+    listed: list[Any] = values
+    return listed

@@ -38,6 +38,8 @@ class Joints:
     action_speed: Sequence[float] = ()  # only if the target is a speed, `action_speed * action` [rad/s or m/s]
     action_torque: Sequence[float] = ()  # only if the target is a torque or force, `action_torque * action`
     measured: str = ""  # observation, or quantity of a term, with the positions or last targets of these joints
+    drive_gain: Sequence[float] = ()  # that stiffness in the drive's own unit: P of a servo, as it is written into it
+    drive_voltage: Sequence[float] = ()  # [V], at which a servo of that gain has this stiffness
     clips_target: bool = False  # whether a position that an action commands is clipped to `low` and `high`
 
     def __post_init__(self) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rlctl.errors import TaskError, UsageError, check_name
+from rlctl.tasks.asked_motors import AskedMotors
 from rlctl.tasks.finger_shapes import find_unfit, fit_boxes, replace_shapes
 from rlctl.tasks.grippers import Gripper, GripperSearch
 from rlctl.tasks.linkage import Linkage
@@ -51,6 +52,7 @@ class _Hand:
     motors: ChosenMotors
     position: Array  # [m], of the base, from where the file has it
     boxed: dict[str, int]  # number of boxes by link
+    asked: AskedMotors | None  # of the arm
 
     @property
     def body(self) -> MujocoBody:
@@ -75,12 +77,20 @@ class _Hand:
         return float(f"{max(0.036 * self.scale, 0.4 * self.gripper.width):.2g}")
 
 
-def read_hand_robot(model: str, kind: str, *, gripper: str | None = None, tip: str | None = None) -> StarterRobot:
+def read_hand_robot(
+    model: str,
+    kind: str,
+    *,
+    gripper: str | None = None,
+    tip: str | None = None,
+    asked: AskedMotors | None = None,
+) -> StarterRobot:
     """Read a user's URDF or MJCF file of an arm with a gripper, for a task of a `kind`: pick, place or push.
 
     `gripper` is a joint of the gripper, `tip` a link whose origin is between the fingers, where these are to be found
-    in the model by default. Raises `UsageError` for a file that is missing or cannot be loaded, and for an arm without
-    a gripper, with one that never closes, or that does not reach the table.
+    in the model by default. The arm has the real motors that are `asked` for, or springs. Raises `UsageError` for a
+    file that is missing or cannot be loaded, and for an arm without a gripper, with one that never closes, or that does
+    not reach the table.
     """
     path = find_own_model(model)
     files = copy_model(path)
@@ -103,13 +113,13 @@ def read_hand_robot(model: str, kind: str, *, gripper: str | None = None, tip: s
             _write({Path(path.name): files[Path(path.name)]}, copy.parent)
             linkage = _load(copy, model)
         boxed = {link: len(fitted) for link, fitted in boxes.items()}
-        hand = _place(kind, path, linkage, found, boxed)
+        hand = dataclasses.replace(_place(kind, path, linkage, found, boxed), asked=asked)
         if looped:
             names, armature = linkage.body.joint_names, hand.motors.armature
             write_armature(files, Path(path.name), {names[joint]: armature[joint] for joint in found.joints})
         files[Path("block.urdf")] = _write_block(hand)
         values, summary = _describe(hand), _summarize(hand, notes)
-    kept = frozenset({kind})
+    kept = frozenset({kind, "drives" if asked is None else "motors"})
     return StarterRobot(values, files, summary, template=TEMPLATE, kept=kept)
 
 
@@ -184,7 +194,7 @@ def _place(kind: str, path: Path, linkage: Linkage, gripper: Gripper, boxed: dic
     table, height = find_table(linkage, gripper, raised, lowest)
     motors = choose_motors(linkage, gripper, table.start, _block_mass(gripper))
     position = np.array([0.0, 0.0, height])
-    return _Hand(kind, path, linkage, gripper, table, motors, position, boxed)
+    return _Hand(kind, path, linkage, gripper, table, motors, position, boxed, None)
 
 
 def _block_mass(gripper: Gripper) -> float:
@@ -309,6 +319,7 @@ def _describe(hand: _Hand) -> dict[str, str]:
         "least_down": write_number(-math.cos(table.tilt + 0.35), ".2g"),
         **_describe_held(hand),
         **_describe_cameras(hand),
+        **_describe_motors(hand),
     }
 
 
@@ -331,6 +342,20 @@ def _describe_cameras(hand: _Hand) -> dict[str, str]:
 def _write_point(values: Sequence[float] | Array) -> SourceText:
     numbers = np.round(values, 3) + 0.0
     return SourceText(f"({join_source(write_number(value, 'g') for value in numbers)})")
+
+
+def _describe_motors(hand: _Hand) -> dict[str, str]:
+    """Return texts of the real motors that were asked for; values that their table does not have are of springs."""
+    if hand.asked is None:
+        return {}
+    chosen = hand.gripper.arm
+    guesses = {
+        "stiffness_nm_per_rad": hand.motors.stiffness,
+        "damping_nms_per_rad": hand.motors.damping,
+        "armature_kgm2": hand.motors.armature,
+    }
+    medians = {name: float(f"{np.median(values[chosen]):.2g}") for name, values in guesses.items()}
+    return hand.asked.write(medians, "arm", joints="ARM")
 
 
 def _describe_held(hand: _Hand) -> dict[str, str]:

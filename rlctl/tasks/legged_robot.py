@@ -12,6 +12,7 @@ import numpy as np
 
 from rlctl.errors import TaskError, UsageError
 from rlctl.task.rotations import rotate_inverse
+from rlctl.tasks.asked_motors import AskedMotors
 from rlctl.tasks.gait import Gait, describe_gait
 from rlctl.tasks.legs import Leg, Skeleton, find_legs, find_wheels
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
@@ -47,6 +48,17 @@ class _Legged:
     steps_up: int  # for which it stands with zero actions, at most `_STEPS`
     height: float  # of the trunk's centre of mass above the ground when it stands [m]
     gait: Gait
+    motors: AskedMotors | None
+
+    @property
+    def guesses(self) -> dict[str, float]:
+        """Values of a real motor that the table of motors may not have."""
+        numbers = self.scaled
+        return {
+            "stiffness_nm_per_rad": numbers.stiffness,
+            "damping_nms_per_rad": numbers.damping,
+            "armature_kgm2": numbers.armature,
+        }
 
     @property
     def scaled(self) -> ScaledRobot:
@@ -65,8 +77,8 @@ class _Legged:
         return [leg.foot.link for leg in self.legs]
 
 
-def read_legged_robot(model: str) -> StarterRobot:
-    """Read a user's URDF or MJCF file of a robot with legs, which is free to move.
+def read_legged_robot(model: str, motors: AskedMotors | None = None) -> StarterRobot:
+    """Read a user's URDF or MJCF file of a robot with legs, which is free to move, with real `motors` or springs.
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a fixed base or no legs.
     """
@@ -88,7 +100,7 @@ def read_legged_robot(model: str) -> StarterRobot:
     keyframe, stance = _find_keyframe(skeleton, legs, search.longest)
     stance = stance or search.find()
     gait = describe_gait(skeleton, legs, stance, mirror)
-    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height, gait)
+    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height, gait, motors)
     steps_up, height = _stand(legged)
     legged = dataclasses.replace(legged, steps_up=steps_up, height=height)
     files = copy_model(path)
@@ -104,6 +116,8 @@ def _choose_lines(legged: _Legged) -> frozenset[str]:
     chosen = {
         kind: True,
         "aside": kind == "clock" and bool(legged.gait.aside),
+        "motors": legged.motors is not None,
+        "drives": legged.motors is None,
         "mirror": bool(legged.gait.other_side),
         f"mirror_{kind}": bool(legged.gait.other_side),
     }
@@ -164,13 +178,17 @@ def _stand(legged: _Legged) -> tuple[int, float]:
     sim.load("ground", "plane.urdf", fixed=True).set_friction(0.8)
     body, numbers = sim.load("robot", legged.path), legged.scaled
     body.set_friction(1.0)
-    body.set_drives(numbers.stiffness, numbers.damping, armature=numbers.armature)
-    body.set_joint_damping(numbers.gear_damping)
+    forces: list[float] | None = None
+    if legged.motors is not None:
+        body.set_motors(legged.motors.complete(legged.guesses))
+    else:
+        body.set_drives(numbers.stiffness, numbers.damping, armature=numbers.armature)
+        body.set_joint_damping(numbers.gear_damping)
+        forces, _ = _limit_forces(legged)
     sim.save()
     stance, world = legged.stance.positions[None], np.zeros(1, np.int64)
     body.set_base(np.array([[0.0, 0.0, numbers.start_height]]), worlds=world)
     body.set_joints(stance, worlds=world)
-    forces, _ = _limit_forces(legged)
     for step in range(_STEPS):
         body.drive_to(stance, max_force=forces)
         sim.step()
@@ -214,7 +232,8 @@ def _list_notes(legged: _Legged) -> list[str]:
     notes += list_faults(legged.body)
     notes += _judge_torques(legged)
     notes += _judge_densities(legged.body)
-    if not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness:
+    is_useless = not all(limits) or min(limits) > _ENDLESS_FORCE * legged.scaled.stiffness
+    if is_useless and legged.motors is None:
         notes.append("The file has no useful torque limits for all joints: write those of your motors into MAX_FORCE")
     # Two legs that are springs hold no robot for long.
     if legged.steps_up < (_STEPS // 4 if legged.is_biped else _STEPS):
@@ -229,13 +248,17 @@ def _list_notes(legged: _Legged) -> list[str]:
 
 def _judge_torques(legged: _Legged) -> list[str]:
     """Return a sentence if the strongest joint of the legs cannot hold the robot up."""
+    advice = "Correct MAX_FORCE"
     largest = max(legged.body.joint_max_force[joint] for joint in legged.joints)
+    if legged.motors is not None:
+        advice = f"{legged.motors.name} is too weak for it"
+        largest = legged.motors.motor.stall_torque_nm or 0.0
     needed = legged.body.total_mass() * GRAVITY * legged.stance.leg_length
     if not 0 < largest < _WEAK * needed:
         return []
     return [
         f"The largest torque limit of its legs, {largest:.3g} N m, is {100 * largest / needed:.2g} % of weight x leg "
-        f"length, {needed:.3g} N m: walking robots have more than {100 * _WEAK:g} %. Correct MAX_FORCE"
+        f"length, {needed:.3g} N m: walking robots have more than {100 * _WEAK:g} %. {advice}"
     ]
 
 
@@ -314,6 +337,7 @@ def _describe(legged: _Legged) -> dict[str, str]:
         "sway_weight": write_number(numbers.sway, "g"),
         "start_noise": "0.05" if legged.is_biped else "0.1",
         **_describe_steps(legged),
+        **({} if legged.motors is None else legged.motors.write(legged.guesses, "robot")),
         "height_weight": write_number(numbers.height, "g"),
         "feet": write_list("FEET = ", map(write_string, sorted(set(legged.feet)))),
         "steps_up": str(steps),

@@ -12,6 +12,7 @@ from rlctl.environments import installed
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
+from rlctl.tasks.asked_motors import AskedMotors
 from rlctl.tasks.source_text import fill_template, quote_code_of_markdown
 from rlctl.tasks.starter_robot import StarterRobot, make_planar_arm, read_robot
 
@@ -57,13 +58,14 @@ class AskedRobot:
     """A joint of the gripper of a hand."""
     tip: str | None = None
     """The link whose origin is between the fingers of a hand."""
+    motors: AskedMotors | None = None
 
     def check(self) -> None:
         """Raise `UsageError` for options that exclude each other, or need another one."""
         kinds = [*(["walk"] if self.walk else []), *self.hand]
         if len(kinds) > 1:
             raise UsageError(f"{' and '.join(f'--{kind}' for kind in kinds)} exclude each other: a task has one aim")
-        chosen = {"link": self.link, "gripper": self.gripper, "tip": self.tip}
+        chosen = {"link": self.link, "gripper": self.gripper, "tip": self.tip, "motors": self.motors}
         given = [*kinds, *(name for name, value in chosen.items() if value is not None)]
         if self.model is None and given:
             raise UsageError(f"--{given[0]} needs --model")
@@ -83,13 +85,17 @@ def create(
     hand: Sequence[str] = (),
     gripper: str | None = None,
     tip: str | None = None,
+    motors: str | None = None,
+    backlash: str | None = None,
 ) -> NewPlugin:
     """Write the plugin `name` atomically into the current folder, of an `AskedRobot`, whose attributes the others are.
+
+    `motors` names one of `rlctl.task.named_motors`, `backlash` is an angle such as `1deg`.
 
     Raises `UsageError` for a name in use, for options that do not fit together, and for a model that is missing, or
     cannot do what is asked.
     """
-    asked = AskedRobot(model, link, walk, tuple(hand), gripper, tip)
+    asked = AskedRobot(model, link, walk, tuple(hand), gripper, tip, AskedMotors.read(motors, backlash))
     asked.check()
     package = name.replace("-", "_").lower()
     _check(name, package)
@@ -121,12 +127,12 @@ def _read_robot(asked: AskedRobot) -> StarterRobot:
     if asked.walk:
         from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
 
-        return read_legged_robot(asked.model)
+        return read_legged_robot(asked.model, asked.motors)
     if asked.hand:
         from rlctl.tasks.hand_robot import read_hand_robot
 
-        return read_hand_robot(asked.model, asked.hand[0], gripper=asked.gripper, tip=asked.tip)
-    return read_robot(asked.model, asked.link)
+        return read_hand_robot(asked.model, asked.hand[0], gripper=asked.gripper, tip=asked.tip, asked=asked.motors)
+    return read_robot(asked.model, asked.link, asked.motors)
 
 
 def _choose_lines(text: str, kept: frozenset[str]) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl.errors import TaskError, UsageError, check_name
+from rlctl.tasks.asked_motors import AskedMotors
 from rlctl.tasks.model_copy import copy_model, find_own_model
 from rlctl.tasks.pybullet_probe import reads_in_pybullet
 from rlctl.tasks.source_text import SourceText, join_source, write_comment, write_list, write_number, write_string
@@ -21,6 +22,8 @@ _PLANAR_ARM = Path(__file__).with_name("arm.urdf")
 _SUSPICIOUS = 3  # so many joints with the same number for effort and speed
 _FASTEST = {"rotates": 3.0, "slides": 0.5}  # [rad/s], [m/s] of a first task; models often have no useful limit
 _GUESSED_FORCE = 10.0  # [N m or N], of a joint without a limit
+_FULL_TORQUE = 0.1  # [rad], from the target at which a motor of unknown gain gives its stall torque
+_GUESSED_DAMPING, _GUESSED_ARMATURE = 0.03, 0.01  # [s], of the stiffness; [kg m^2]
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
 _IN_FLOOR = 1e-3  # [m]
 _TRIES = 300
@@ -83,7 +86,7 @@ def make_planar_arm() -> StarterRobot:
         values,
         dict([arm]),
         "A planar arm moves its tip to a goal. Comments with CHANGE in task.py mark what to replace",
-        kept=frozenset({"origin"}),
+        kept=frozenset({"origin", "drives"}),
     )
 
 
@@ -96,10 +99,13 @@ class _Arm:
     joints: list[str]  # that move the tip
     start: Any  # positions of all joints
     height: float  # [m], of the base above where the file has it
+    motors: AskedMotors | None
 
 
-def read_robot(model: str, link: str | None) -> StarterRobot:
+def read_robot(model: str, link: str | None, motors: AskedMotors | None = None) -> StarterRobot:
     """Read a user's URDF or MJCF file; `link` is the tip, by default that of `ArmModel.find_tip`.
+
+    It has real `motors`, or ideal ones.
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a free base or no such link.
     """
@@ -121,9 +127,14 @@ def read_robot(model: str, link: str | None) -> StarterRobot:
         raise UsageError(f"--link {name!r}: no joint moves it; choose another of: {', '.join(body.link_names)}")
     tip = arm.choose_point(name)
     start, height = _find_start(arm, tip)
-    described = _Arm(body, path, arm, tip, joints, start, height)
-    only_mujoco = not reads_in_pybullet(path, body.joint_names)
-    kept = {"point" if tip.point is not None else "origin": True, "mujoco": only_mujoco}
+    described = _Arm(body, path, arm, tip, joints, start, height, motors)
+    only_mujoco = motors is None and not reads_in_pybullet(path, body.joint_names)
+    kept = {
+        "point" if tip.point is not None else "origin": True,
+        "mujoco": only_mujoco,
+        "motors": motors is not None,
+        "drives": motors is None,
+    }
     return StarterRobot(
         _describe(described),
         copy_model(path),
@@ -212,7 +223,21 @@ def _describe(arm: _Arm) -> dict[str, str]:
         "reach": write_number(math.ceil(100 * (farthest + arm.height)) / 100, "g"),
         "total_timesteps": "200_000",
         "every_steps": "40_000",
+        **_describe_motors(arm),
     }
+
+
+def _describe_motors(arm: _Arm) -> dict[str, str]:
+    """Return texts of the real motors that were asked for; values that their table does not have are guesses."""
+    if arm.motors is None:
+        return {}
+    stiffness = (arm.motors.motor.stall_torque_nm or _GUESSED_FORCE) / _FULL_TORQUE
+    guesses = {
+        "stiffness_nm_per_rad": float(f"{stiffness:.2g}"),
+        "damping_nms_per_rad": float(f"{_GUESSED_DAMPING * stiffness:.2g}"),
+        "armature_kgm2": _GUESSED_ARMATURE,
+    }
+    return arm.motors.write(guesses, "arm")
 
 
 def _write_pose(arm: _Arm) -> SourceText:

@@ -1,5 +1,7 @@
 """A controller maps a program's values to the policy's, and its targets back, as a file such as diagnose's says."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.plan import ControllerPlan
 from rlctl.exporting.controller.program_mapping import read_mapping
 from rlctl.exporting.controller.source import ControllerSource
+from rlctl.exporting.onnx_source import make_metadata
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import encode
 from rlctl.policy.policy import Policy
@@ -139,6 +142,17 @@ def test_what_diagnose_prints_of_actions_is_accepted_with_the_targets(legs, tmp_
     assert mapping.targets.order.tolist() == [1, 0]
     with pytest.raises(UsageError, match="actions: what diagnose prints there is of the policy's action"):
         read(legs, tmp_path, yaml_text.dump({"actions": printed["actions"]}))
+
+
+def test_exports_have_the_gains_of_servos_in_their_own_unit(legs):
+    joints = dataclasses.replace(legs.info.env.joints, drive_gain=32.0, drive_voltage=7.4)
+    env = legs.info.env.model_copy(update={"joints": joints})
+    servos = dataclasses.replace(legs, info=legs.info.model_copy(update={"env": env}))
+    header = ControllerSource(servos, plan_of(servos), "controller", None).write().header
+    assert "const double controller_drive_gain[CONTROLLER_ACTION_SIZE]" in header
+    metadata = make_metadata(servos.info)
+    assert (metadata["drive_gain"], metadata["drive_voltage"]) == ("32,32", "7.4,7.4")
+    assert "drive_gain" not in make_metadata(legs.info)
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

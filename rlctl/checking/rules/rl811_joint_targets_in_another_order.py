@@ -15,7 +15,7 @@ from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.rules.rl810_joint_target_in_degrees import find_targets_in_degrees
 from rlctl.checking.world_logs import LoggedWorld
-from rlctl.checking.worlds import Array, Motor
+from rlctl.checking.worlds import Array, JointActuator
 
 RULE = Rule(
     "RL811",
@@ -123,7 +123,7 @@ def _measure_answer(
     return answers
 
 
-def _is_feedback(motors: Sequence[Motor], answers: Array, exchanged: Mapping[int, int]) -> bool:
+def _is_feedback(motors: Sequence[JointActuator], answers: Array, exchanged: Mapping[int, int]) -> bool:
     """Say whether forces pull back, as those of a controller do, and targets move with the position that they are
     relative to."""
     signs = [(1 if motors[motor].holds_position else -1) * motors[motor].gear for motor in exchanged]

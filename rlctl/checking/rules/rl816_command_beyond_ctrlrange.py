@@ -11,7 +11,7 @@ from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.rules.rl810_joint_target_in_degrees import find_ranges_in_degrees, find_targets_in_degrees
 from rlctl.checking.rules.rl811_joint_targets_in_another_order import find_other_orders
-from rlctl.checking.worlds import Array, Motor
+from rlctl.checking.worlds import Array, JointActuator
 
 RULE = Rule(
     "RL816",
@@ -70,7 +70,7 @@ def _find_kept_targets(trial: MotorTrial) -> Iterator[RuleFinding]:
             return
 
 
-def _find_beyond(motors: Sequence[Motor], commands: Array) -> dict[int, tuple[float, float]]:
+def _find_beyond(motors: Sequence[JointActuator], commands: Array) -> dict[int, tuple[float, float]]:
     """Return the motors with a position target far beyond their range, and the range."""
     beyond = {}
     for number, (motor, command) in enumerate(zip(motors, commands.tolist(), strict=True)):
@@ -85,7 +85,7 @@ def _count_stuck(commands: Sequence[Array | None], motor: int, low: float, high:
     return inside.index(True) if True in inside else len(inside)
 
 
-def _describe_kept(motor: Motor, number: int, target: float, which: str, steps: int, stuck: int) -> RuleFinding:
+def _describe_kept(motor: JointActuator, number: int, target: float, which: str, steps: int, stuck: int) -> RuleFinding:
     what = (
         f"the {which} action, held for {steps} steps, brings the target ctrl[{number}] ({motor.name}) to {target:.4g}"
     )

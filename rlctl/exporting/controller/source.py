@@ -206,7 +206,12 @@ class ControllerSource:
         if env.joints is not None and env.joints.low and env.joints.high:
             numbers |= {"joint_low": np.array(env.joints.low), "joint_high": np.array(env.joints.high)}
         if env.joints is not None:
-            gains = {"joint_stiffness": env.joints.stiffness, "joint_damping": env.joints.damping}
+            gains = {
+                "joint_stiffness": env.joints.stiffness,
+                "joint_damping": env.joints.damping,
+                "drive_gain": env.joints.drive_gain,
+                "drive_voltage": env.joints.drive_voltage,
+            }
             numbers |= {name: np.array(values) for name, values in gains.items() if values}
         for name, array in numbers.items():
             arrays.append(("double", name, "ACTION_SIZE", [write_number(value, "double") for value in array]))

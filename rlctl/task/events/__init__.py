@@ -1,9 +1,13 @@
 """Named random changes: domain randomisation, pushes, noise and delay."""
 
 from rlctl.task.events.changes import OF_APPEARANCE as OF_APPEARANCE
+from rlctl.task.events.changes import backlash as backlash
 from rlctl.task.events.changes import delay as delay
 from rlctl.task.events.changes import kick as kick
 from rlctl.task.events.changes import lock_joints as lock_joints
+from rlctl.task.events.changes import motor_bias as motor_bias
+from rlctl.task.events.changes import motor_delay as motor_delay
+from rlctl.task.events.changes import motor_friction as motor_friction
 from rlctl.task.events.changes import move_camera as move_camera
 from rlctl.task.events.changes import noise as noise
 from rlctl.task.events.changes import offset_joints as offset_joints
@@ -18,6 +22,8 @@ from rlctl.task.events.changes import set_friction as set_friction
 from rlctl.task.events.changes import set_joint_damping as set_joint_damping
 from rlctl.task.events.changes import set_light as set_light
 from rlctl.task.events.changes import shift_gravity as shift_gravity
+from rlctl.task.events.changes import torque_constant as torque_constant
+from rlctl.task.events.changes import voltage as voltage
 from rlctl.task.events.event import Event as Event
 from rlctl.task.events.event import EventSettings as EventSettings
 from rlctl.task.events.event import Fraction as Fraction

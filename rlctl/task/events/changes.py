@@ -90,6 +90,70 @@ def scale_motor_strength(sim: Sim, rng: Rng, *, body: str, factor: NotNegative, 
     return {"factor": drawn}
 
 
+@acts_at("reset", "start", "interval")
+def motor_friction(sim: Sim, rng: Rng, *, body: str, coulomb_nm: NotNegative, joints: Sequence[str] = ()) -> Drawn:
+    """Set the dry friction of `joints`, or of all [N m or N]; every joint draws its own.
+
+    The viscous part is the joint's damping: `set_joint_damping` and `scale_joint_damping`.
+    """
+    drawn = _draw_per_joint(sim, rng, body, joints, coulomb_nm)
+    sim.body(body).set_joint_friction(np.array(list(drawn.values())), joints)
+    return drawn
+
+
+@acts_at("reset", "start", "interval")
+def backlash(sim: Sim, rng: Rng, *, body: str, backlash_rad: NotNegative, joints: Sequence[str] = ()) -> Drawn:
+    """Set the play of `joints`, or of all [rad or m], from end to end; every joint draws its own.
+
+    They need `set_motors(.., backlash_rad=0.01)` in `build`, with any play above 0.
+    """
+    drawn = _draw_per_joint(sim, rng, body, joints, backlash_rad)
+    sim.body(body).set_backlash(np.array(list(drawn.values())), joints)
+    return drawn
+
+
+@acts_at("reset", "start", "interval")
+def voltage(sim: Sim, rng: Rng, *, body: str, voltage_v: Positive, joints: Sequence[str] = ()) -> Drawn:
+    """Set the supply of the motors of `joints`, or of all [V]: one battery feeds them."""
+    drawn = float(rng.uniform(*voltage_v))
+    sim.body(body).set_voltage(drawn, joints)
+    return {"voltage_v": drawn}
+
+
+@acts_at("reset", "start", "interval", factor=1.0)
+def torque_constant(sim: Sim, rng: Rng, *, body: str, factor: Positive, joints: Sequence[str] = ()) -> Drawn:
+    """Scale the torque constants of the motors of `joints`, or of all; every motor draws its own factor."""
+    drawn = _draw_per_joint(sim, rng, body, joints, factor)
+    sim.body(body).scale_torque_constant(np.array(list(drawn.values())), joints)
+    return drawn
+
+
+@acts_at("reset", "start", "interval", bias_rad=0.0)
+def motor_bias(sim: Sim, rng: Rng, *, body: str, bias_rad: Range, joints: Sequence[str] = ()) -> Drawn:
+    """Set what the encoders of `joints`, or of all, read at 0 [rad or m]; every joint draws its own."""
+    drawn = _draw_per_joint(sim, rng, body, joints, bias_rad)
+    sim.body(body).set_encoder_bias(np.array(list(drawn.values())), joints)
+    return drawn
+
+
+@acts_at("reset", "start", "interval")
+def motor_delay(sim: Sim, rng: Rng, *, body: str, delay_s: NotNegative, joints: Sequence[str] = ()) -> Drawn:
+    """Set the time from a command to the torque of the motors of `joints`, or of all [s], to whole physics steps.
+
+    It may be up to twice that of `set_motors(.., delay_s=0.02)` in `build`.
+    """
+    drawn = float(rng.uniform(*delay_s))
+    sim.body(body).set_motor_delay(drawn, joints)
+    return {"delay_s": drawn}
+
+
+def _draw_per_joint(sim: Sim, rng: Rng, body: str, joints: Sequence[str], values: Range) -> Drawn:
+    """Return a number per joint, by its name."""
+    changed = sim.body(body)
+    names = [changed.joint_names[joint] for joint in changed.find_joints(joints)]
+    return dict(zip(names, rng.uniform(*values, len(names)).tolist(), strict=True))
+
+
 @acts_at("start", "interval")
 def lock_joints(sim: Sim, rng: Rng, *, body: str, joints: Sequence[str]) -> Drawn:
     """Hold `joints` where they are until the end of the episode, whatever the motors do."""

@@ -82,6 +82,8 @@ class MujocoBody(MujocoMotors):
     @property
     def joint_positions(self) -> Array:
         positions: Array = self._fields.data("qpos")[..., self._positions].copy()
+        if self.parts.has_bias:
+            positions += self._fields.model("encoder bias")[..., self.parts.motors]
         return positions
 
     @property
@@ -207,7 +209,10 @@ class MujocoBody(MujocoMotors):
     ) -> Array:
         sim = self._single("solve_inverse_kinematics")
         turn = None if orientation is None else np.asarray(orientation, float)[WXYZ]
-        return solve(sim, self.parts, self.find_link(link), np.asarray(position, float), turn)
+        found = solve(sim, self.parts, self.find_link(link), np.asarray(position, float), turn)
+        if self.parts.has_bias:
+            found = found + self._fields.model("encoder bias")[..., self.parts.motors]
+        return found
 
     def set_base(
         self,
@@ -256,6 +261,10 @@ class MujocoBody(MujocoMotors):
         places, speeds = self._fields.data("qpos"), self._fields.data("qvel")
         shape = places[rows][..., self._positions].shape
         self._check("positions", positions, shape)
+        if self.parts.has_bias:
+            positions = positions - self._fields.model("encoder bias")[rows][..., self.parts.motors]
+        for play in self.parts.plays.values():
+            places[rows, play.position] = speeds[rows, play.velocity] = 0.0
         if isinstance(self._positions, slice) or worlds is None:
             places[rows, self._positions] = positions
             speeds[rows, self._velocities] = 0.0 if velocities is None else velocities

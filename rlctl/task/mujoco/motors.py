@@ -3,20 +3,35 @@
 Each joint has an actuator with the force `ctrl + b1 * position + b2 * velocity`, within a range. `drive_to` makes it a
 spring and a damper (b1 = -stiffness, b2 = -damping), `drive_at` a damper, `set_torques` a force. Without `set_drives`
 those of a single world are `IdealMotors` in a command whose joints all turn without limits, as wheels do; all others
-are springs and dampers which come close.
+are springs and dampers which come close. `set_motors` makes actuators MuJoCo's DC motors, see `real_motors.py`: their
+controllers have the same springs and dampers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body, Drives
+from rlctl.task.motors import Motor, Motors
 from rlctl.task.mujoco.ideal_motors import IDEAL_DAMPING, IdealMotors
 from rlctl.task.mujoco.parts import Parts, find_slice
+from rlctl.task.mujoco.real_motors import (
+    CONSTANT,
+    DAMPING,
+    INTEGRAL,
+    RESISTANCE,
+    STIFFNESS,
+    VOLTAGE,
+    MotorArrays,
+    count_samples,
+    delay_of,
+    list_history,
+)
 from rlctl.task.mujoco.world import Rows
 
 if TYPE_CHECKING:
@@ -40,6 +55,8 @@ class _Mode(NamedTuple):
     force: Array  # its limit [N m or N]
     max_speed: Array | None
     is_ideal: bool  # see `IdealMotors`
+    is_real: NDArray[np.bool_]  # whether `set_motors` has set the joint's motor
+    real_motors: NDArray[np.int64]  # numbers of those
 
 
 class MujocoMotors(Body):
@@ -57,9 +74,19 @@ class MujocoMotors(Body):
         """What `set_drives` set."""
         return None if self.parts.drives is None else Drives(*self.parts.drives[:2])
 
+    @property
+    def motors(self) -> Mapping[str, Motor]:  # type: ignore[override]
+        """What `set_motors` set, by joint."""
+        return {self.joint_names[joint]: motor for joint, motor in sorted(self.parts.real.items())}
+
     def bind_motors(self) -> None:
         """Take the numbers of a newly compiled model."""
         self._motors = np.arange(self._sim.model.nu)[self.parts.motors]
+        self._real = MotorArrays(self.parts.real, len(self.joint_names))
+        self._history = list_history(self._sim.model, self._motors.tolist())
+        for joint, motor in self.parts.real.items():
+            self.joint_max_force[joint] = motor.stall_torque_nm or self.joint_max_force[joint]
+            self.joint_max_speed[joint] = motor.no_load_speed_rad_per_s or self.joint_max_speed[joint]
         self._modes.clear()
         self.parts.active.clear()
         self._cap = self.parts.speed_cap
@@ -100,6 +127,47 @@ class MujocoMotors(Body):
         self._write_armature(inertia)
         self._modes.clear()
 
+    def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
+        chosen = self._spread_motors(motors, joints, changes)
+        self._check_armature(chosen)
+        self.parts.real |= chosen
+        named = {self.joint_names[joint]: motor for joint, motor in chosen.items()}
+        self._sim.add_motors(self.name, named)
+        self._write_motors(chosen)
+
+    def _check_armature(self, motors: Mapping[int, Motor]) -> None:
+        """Raise `TaskError` for play without an inertia of the motor, which moves in it."""
+        model = self._sim.model
+        own = model.dof_armature[self.parts.velocities]
+        for joint, motor in motors.items():
+            armature = own[joint] if motor.armature_kgm2 is None else motor.armature_kgm2
+            if motor.backlash_rad > 0 and armature <= 0:
+                raise TaskError(
+                    f"{self.file.name}: joint {self.joint_names[joint]!r} has backlash and no armature; give its "
+                    "motor armature_kgm2, the inertia of rotor and gears"
+                )
+
+    def _write_motors(self, motors: Mapping[int, Motor]) -> None:
+        """Write what a compilation takes from the model before it."""
+        model = self._sim.model
+        dofs = np.arange(model.nv)[self.parts.velocities]
+        for joint, motor in motors.items():
+            model.actuator_biasprm[self._motors[joint]] = 0.0  # that of a DC motor has other elements
+            given = {
+                "dof_armature": motor.armature_kgm2,
+                "dof_frictionloss": motor.coulomb_friction_nm,
+                "dof_damping": motor.viscous_friction_nms_per_rad,
+            }
+            for name, value in given.items():
+                if value is not None:
+                    getattr(model, name)[dofs[joint]] = value
+            if motor.backlash_rad > 0:
+                half = motor.backlash_rad / 2
+                model.jnt_range[self.parts.plays[joint].joint] = -half, half
+            encoder_bias = self._sim.world.extra["encoder bias"]
+            encoder_bias[self._motors[joint]] = motor.encoder_bias_rad
+            self.parts.has_bias = self.parts.has_bias or motor.encoder_bias_rad != 0
+
     def _write_armature(self, armature: Array | None) -> None:
         if armature is not None:
             self._sim.model.dof_armature[self.parts.velocities] = armature
@@ -117,17 +185,57 @@ class MujocoMotors(Body):
         mode = self._find_mode("position", joints, max_force, gain, max_speed)
         targets = self._read(positions, mode)
         self._write_mode(mode)
+        if self.parts.has_bias:
+            targets = targets - self._fields.model("encoder bias")[..., mode.motors]
         if mode.is_ideal:
             self._ideal.aim_at(mode.motors, targets)
             return
-        force = mode.stiffness * targets
+        force = self._read_stiffness(mode) * targets
         if mode.max_speed is not None:
             force = self._limit_approach(mode, targets, force)
-        if self.parts.drives is None:
-            force = force + self._hold(mode)
+        if self.parts.drives is None and not mode.is_real.all():
+            force = force + np.where(mode.is_real, 0.0, self._hold(mode))
         elif velocities is not None:
             force = force + mode.damping * self._read(velocities, mode)
-        self._fields.data("ctrl")[..., mode.motors] = force
+        if self._real.has_integral.any():
+            force = self._aim_integrals(mode, targets, velocities, force)
+        self._write_controls(mode, force)
+
+    def _read_stiffness(self, mode: _Mode) -> Array:
+        """Return the stiffness of the joints now; that of a real motor follows its voltage and its constant."""
+        if not len(mode.real_motors):
+            return mode.stiffness
+        gains: Array = self._fields.model("actuator_gainprm")[..., mode.motors, STIFFNESS]
+        return np.where(mode.is_real, gains, mode.stiffness)
+
+    def _aim_integrals(self, mode: _Mode, targets: Array, velocities: Any, force: Array) -> Array:
+        """Return the controls; that of a controller with an integral is its target, not a torque."""
+        if velocities is not None:
+            targets = targets + self._read(velocities, mode) * mode.damping / np.maximum(mode.stiffness, 1e-9)
+        return np.where(self._real.has_integral[mode.joints], targets, force)
+
+    def _write_controls(self, mode: _Mode, controls: Array) -> None:
+        if self.parts.has_delay and len(mode.real_motors):
+            self._fill_history(mode)
+        self._fields.data("ctrl")[..., mode.motors] = controls
+
+    def _fill_history(self, mode: _Mode) -> None:
+        """After a reset, let motors with a delay hold the joints where they are, until the first command arrives."""
+        awaits = self._fields.model("awaits command")
+        if not np.count_nonzero(awaits[..., mode.motors]):
+            return
+        positions = self._fields.data("qpos")[..., mode.positions]
+        velocities = self._fields.data("qvel")[..., mode.velocities]
+        hold = self._read_stiffness(mode) * positions + mode.damping * velocities
+        hold = np.where(self._real.has_integral[mode.joints], positions, hold)
+        history = self._fields.data("history")
+        for place, joint in enumerate(mode.joints):
+            cells = self._history[joint]
+            if not len(cells):
+                continue
+            first = awaits[..., self._motors[joint]] > 0
+            history[..., cells] = np.where(first[..., None], hold[..., place, None], history[..., cells])
+        awaits[..., mode.motors] = 0.0
 
     @property
     def _ideal(self) -> IdealMotors:
@@ -161,7 +269,9 @@ class MujocoMotors(Body):
         if mode.is_ideal:
             self._ideal.aim_at(mode.motors, targets)
             return
-        self._fields.data("ctrl")[..., mode.motors] = mode.damping * targets + self._hold(mode)
+        self._check_torque(mode, "drive_at")
+        hold = 0.0 if mode.is_real.all() else np.where(mode.is_real, 0.0, self._hold(mode))
+        self._write_controls(mode, mode.damping * targets + hold)
 
     def disable_motors(self, joints: Sequence[str] = ()) -> None:
         chosen = self.find_joints(joints)
@@ -174,8 +284,17 @@ class MujocoMotors(Body):
         mode = self._find_mode("torque", joints, np.inf, 0.0, None)
         given = self._read(torques, mode)
         self._check_free(mode.joints)
+        if given.any():
+            self._check_torque(mode, "set_torques")
         self._write_mode(mode)
-        self._fields.data("ctrl")[..., mode.motors] = given * self._fields.model("strength")[..., mode.motors]
+        self._write_controls(mode, given * self._fields.model("strength")[..., mode.motors])
+
+    def _check_torque(self, mode: _Mode, method: str) -> None:
+        """Raise `TaskError` for a motor that takes positions only."""
+        chosen = np.flatnonzero(self._real.has_integral[mode.joints])
+        if len(chosen):
+            name = self.joint_names[mode.joints[chosen[0]]]
+            raise TaskError(f"{method}: the controller of {name!r} has an integral of the position; use drive_to")
 
     def set_controls(self, values: Array, actuators: Sequence[str] = ()) -> None:
         names = self.parts.own_actuators
@@ -231,10 +350,19 @@ class MujocoMotors(Body):
         damping = np.clip(force * dt / (inertia * fastest), 1.0, _STIFFEST) * inertia / dt
         stiffness = gain * damping / dt
         speed = None
+        is_real = self._real.is_real[chosen]
+        force = np.where(is_real, self._limit_real(chosen, max_force, force), force)
         if kind == "position":
             if self.parts.drives is not None:
                 stiffness, damping = (values[chosen] for values in self.parts.drives[:2])
+            if max_speed is not None and is_real.any():
+                raise TaskError(
+                    f"{self.file.name}: max_speed of a real motor: its speed follows from its voltage; leave it out"
+                )
+            stiffness = np.where(is_real, self._real.stiffness[chosen], stiffness)
+            damping = np.where(is_real, self._real.damping[chosen], damping)
             default = self.joint_max_speed[chosen] if self.parts.drives is None else np.zeros(len(chosen))
+            default = np.where(is_real, 0.0, default)
             given = default if max_speed is None else np.broadcast_to(np.asarray(max_speed, float), len(chosen))
             speed = np.where(given > 0, given, np.inf) if (given > 0).any() else None
         elif kind == "torque":
@@ -242,7 +370,7 @@ class MujocoMotors(Body):
         # Wheels carry a robot. The springs of arms and legs come close, without Python between physics steps.
         is_wheel = bool(np.isinf(self.joint_high[chosen]).all())
         is_ideal = is_wheel and self._sim.world.count is None and kind != "torque"
-        if kind == "position" and self.parts.drives is not None:
+        if (kind == "position" and self.parts.drives is not None) or is_real.any():
             is_ideal = False
         if is_ideal:
             damping = IDEAL_DAMPING * inertia / dt
@@ -258,7 +386,16 @@ class MujocoMotors(Body):
             force=force,
             max_speed=speed,
             is_ideal=is_ideal,
+            is_real=is_real,
+            real_motors=self._motors[chosen][is_real],
         )
+
+    def _limit_real(self, joints: list[int], max_force: Any, limits: Array) -> Array:
+        """Return the torques that the task, or the model file where nothing else is known, allows real motors."""
+        own = self._real.max_torque[joints]
+        if max_force is not None:
+            return np.minimum(own, np.broadcast_to(np.asarray(max_force, float), len(joints)))
+        return np.where(np.isfinite(self._real.stall_torque[joints]), np.minimum(own, _UNLIMITED), limits)
 
     def _write_mode(self, mode: _Mode) -> None:
         """Write a kind of command into the model, if it is not there yet."""
@@ -266,8 +403,11 @@ class MujocoMotors(Body):
             return
         self.parts.active.update(dict.fromkeys(mode.joints, mode))
         biases, ranges = self._fields.model("actuator_biasprm"), self._fields.model("actuator_forcerange")
-        biases[..., mode.motors, 1], biases[..., mode.motors, 2] = -mode.stiffness, -mode.damping
+        stiffness, damping = np.where(mode.is_real, 0.0, mode.stiffness), np.where(mode.is_real, 0.0, mode.damping)
+        biases[..., mode.motors, 1], biases[..., mode.motors, 2] = -stiffness, -damping
         force = mode.force * self._fields.model("strength")[..., mode.motors]
+        if len(mode.real_motors):
+            force[..., mode.is_real] = self._write_real(mode)
         if self._sim.world.count is None:
             self._ideal.release(mode.motors)
         if mode.is_ideal:
@@ -281,6 +421,83 @@ class MujocoMotors(Body):
             )
             force = np.full_like(force, _UNLIMITED)  # `IdealMotors` limits it
         ranges[..., mode.motors, 0], ranges[..., mode.motors, 1] = -force, force
+
+    def _write_real(self, mode: _Mode) -> Array:
+        """Write the controllers of real motors; return the limits of their torques, shape (..., motors)."""
+        numbers, gains = mode.real_motors, self._fields.model("actuator_gainprm")
+        chosen = np.array(mode.joints)[mode.is_real]
+        nominal = self._sim.world.built("actuator_gainprm")[numbers]
+        constants, voltages = gains[..., numbers, CONSTANT], gains[..., numbers, VOLTAGE]
+        scale = constants / nominal[:, CONSTANT]
+        by_voltage = self._real.regulates_voltage[chosen]
+        # A servo's controller computes a fraction of its supply: with less voltage it is less stiff.
+        gain = np.where(by_voltage, scale * voltages / np.maximum(nominal[:, VOLTAGE], 1e-9), scale)
+        back_emf = np.where(by_voltage, constants**2 / nominal[:, RESISTANCE], 0.0)
+        is_position = mode.key[0] == "position"
+        gains[..., numbers, STIFFNESS] = gain * mode.stiffness[mode.is_real]
+        gains[..., numbers, DAMPING] = gain * mode.damping[mode.is_real] + back_emf
+        gains[..., numbers, INTEGRAL] = gain * self._real.integral[chosen] * is_position
+        strength = self._fields.model("strength")[..., numbers]
+        limits = np.minimum(mode.force[mode.is_real], scale * self._real.current_torque[chosen])
+        weak = strength * np.minimum(limits, self._real.stall_torque[chosen])
+        result: Array = np.where(strength == 1.0, limits, weak)
+        return result
+
+    def set_joint_friction(self, friction: Any, joints: Sequence[str] = ()) -> None:
+        dofs = np.arange(self._sim.model.nv)[self.parts.velocities][self.find_joints(joints)]
+        self._fields.model("dof_frictionloss")[..., dofs] = friction
+        self._fields.touch()
+
+    def set_backlash(self, backlash: Any, joints: Sequence[str] = ()) -> None:
+        chosen = self.find_joints(joints)
+        for joint in chosen:
+            if joint not in self.parts.plays:
+                raise TaskError(
+                    f"{self.file.name}: joint {self.joint_names[joint]!r} has no play that could change; call "
+                    "set_motors(.., backlash_rad=0.01) in build first"
+                )
+        numbers = [self.parts.plays[joint].joint for joint in chosen]
+        half = np.asarray(backlash, float) / 2
+        ranges = self._fields.model("jnt_range")
+        ranges[..., numbers, 0], ranges[..., numbers, 1] = -half, half
+        self._fields.touch()
+
+    def set_voltage(self, voltage: Any, joints: Sequence[str] = ()) -> None:
+        numbers = self._find_real(joints, "set_voltage")
+        if not self._sim.world.built("actuator_gainprm")[numbers, VOLTAGE].all():
+            raise TaskError(f"{self.file.name}: set_voltage: these motors have no voltage_v; give it to set_motors")
+        self._fields.model("actuator_gainprm")[..., numbers, VOLTAGE] = voltage
+        self.parts.active.clear()
+
+    def scale_torque_constant(self, factor: Any, joints: Sequence[str] = ()) -> None:
+        numbers = self._find_real(joints, "scale_torque_constant")
+        nominal = self._sim.world.built("actuator_gainprm")[numbers, CONSTANT]
+        self._fields.model("actuator_gainprm")[..., numbers, CONSTANT] = factor * nominal
+        self.parts.active.clear()
+
+    def set_encoder_bias(self, bias: Any, joints: Sequence[str] = ()) -> None:
+        self.parts.has_bias = True
+        self._fields.model("encoder bias")[..., self._motors[self.find_joints(joints)]] = bias
+
+    def set_motor_delay(self, delay_s: float, joints: Sequence[str] = ()) -> None:
+        numbers, model = self._find_real(joints, "set_motor_delay"), self._sim.model
+        steps, room = count_samples(delay_s, model.opt.timestep), int(model.actuator_history[numbers, 0].min())
+        if steps > room:
+            raise TaskError(
+                f"{self.file.name}: a delay of {delay_s:g} s; set_motors made room for "
+                f"{room * model.opt.timestep:g} s: call set_motors(.., delay_s={delay_s:g}) in build"
+            )
+        self._fields.model("actuator_delay")[..., numbers] = delay_of(steps, model.opt.timestep)
+
+    def _find_real(self, joints: Sequence[str], method: str) -> NDArray[np.int64]:
+        """Return the numbers of real motors; raises `TaskError` for a joint without one."""
+        chosen = self.find_joints(joints)
+        for joint in chosen:
+            if joint not in self.parts.real:
+                name = self.joint_names[joint]
+                raise TaskError(f"{self.file.name}: {method}: joint {name!r} has no motor; call set_motors in build")
+        numbers: NDArray[np.int64] = self._motors[chosen]
+        return numbers
 
     def scale_motor_strength(self, factor: float, joints: Sequence[str] = ()) -> None:
         motors = self._motors[self.find_joints(joints)]

@@ -1,8 +1,10 @@
 """What a body in MuJoCo needs of the `Sim` that it is in: `MujocoSim`, or one world of it."""
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from rlctl.task.body import Array
+from rlctl.task.motors import Motor
 from rlctl.task.mujoco.world import Fields, MujocoWorld
 
 
@@ -25,6 +27,9 @@ class BodyOwner(Protocol):
 
     def add_force_sensor(self, joint: str, link: str) -> None:
         """Measure the force in a joint."""
+
+    def add_motors(self, body: str, motors: Mapping[str, Motor]) -> None:
+        """Make motors of a body real ones, by joint."""
 
     def spread_friction(self) -> None:
         """Give every pair of links its friction again."""

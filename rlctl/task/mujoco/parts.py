@@ -1,15 +1,25 @@
 """What a body consists of in MuJoCo: names from its file, and their numbers in the compiled model."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rlctl.task.motors import Motor
 from rlctl.task.mujoco.files import ModelFile, is_colliding
+from rlctl.task.mujoco.real_motors import name_play
 from rlctl.task.mujoco.world import Array
 
 WORLD = "world"
 """MuJoCo's name of what all bodies are in; an MJCF file may give it shapes, such as a floor."""
+
+
+class JointPlay(NamedTuple):
+    """Numbers of the joint that is the play of another: the joint, and its elements of `qpos` and `qvel`."""
+
+    joint: int
+    position: int
+    velocity: int
 
 
 class Parts:
@@ -44,9 +54,20 @@ class Parts:
         speeds = [file.max_speed.get(joint, 0.0) for joint in self.joint_names]
         self.speed_cap = max(speeds) if fixed and speeds and min(speeds) > 0 else math.inf
         self.drives: tuple[Array, Array, Array | None] | None = None
+        self.real: dict[int, Motor] = {}
+        """Motors of `set_motors`, by joint."""
+        self.plays: dict[int, JointPlay] = {}
+        """The joints in series that are the play of others, by joint."""
+        self.has_bias = False
+        """Whether an encoder has read something else than the joint's position."""
         self.inertia: Array | None = None
         self.active: dict[int, object] = {}
         """By joint, the kind of command that is written into the model."""
+
+    @property
+    def has_delay(self) -> bool:
+        """Whether commands reach a motor late."""
+        return any(motor.delay_s > 0 for motor in self.real.values())
 
     def may_collide(self, one: int, two: int) -> bool:
         """Return whether the file's masks let two of its own geoms collide, by MuJoCo's rule."""
@@ -68,12 +89,23 @@ class Parts:
         limited, limits = model.jnt_limited[joints][:, None], model.jnt_range[joints]
         self.low, self.high = np.where(limited, limits, (-np.inf, np.inf)).T
         self.joints = joints
+        self.plays = {}
+        for joint, name in enumerate(self.joint_names):
+            if (number := _find_joint(model, name_play(self.name, name))) is not None:
+                self.plays[joint] = JointPlay(number, int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number]))
         self.geoms = [model.geom(f"{prefix}{number}").id for number, _ in self.collision_geoms]
         """Numbers of the geoms that collide."""
         self.free: tuple[int, int] | None = None  # where the state of a free base begins, in qpos and qvel
         for joint in range(model.njnt):
             if model.jnt_type[joint] == 0 and model.jnt_bodyid[joint] == self.links[self.base_name]:
                 self.free = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
+
+
+def _find_joint(model: Any, name: str) -> int | None:
+    try:
+        return int(model.joint(name).id)
+    except KeyError:
+        return None
 
 
 def find_slice(numbers: Any) -> Any:

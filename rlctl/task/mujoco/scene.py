@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,9 +12,11 @@ import numpy as np
 from rlctl.errors import TaskError
 from rlctl.task.attachments import Attachment
 from rlctl.task.model_files import find_model_file
+from rlctl.task.motors import Motor
 from rlctl.task.mujoco.files import ModelFile, is_colliding, read_model_file
 from rlctl.task.mujoco.parts import WORLD, Parts
 from rlctl.task.mujoco.pictures import add_checker, light_scene
+from rlctl.task.mujoco.real_motors import add_motors
 from rlctl.task.mujoco.world import Array
 
 _RIGID = (0.9999, 0.9999, 0.001, 0.5, 2)  # impedance of constraints: as stiff as PyBullet's
@@ -121,6 +123,10 @@ class MujocoScene:
             self._add_pairs(other, parts)
         self.parts[name] = parts
         return parts
+
+    def add_motors(self, body: str, motors: Mapping[str, Motor]) -> None:
+        """Make motors of a body real ones, by joint."""
+        add_motors(self.mujoco, self.spec, body, motors)
 
     def connect(self, kind: Any, first: Attachment, second: Attachment) -> None:
         """Add a constraint of a kind of `mjtEq` between two places on links."""
@@ -237,7 +243,7 @@ def _keep_changes(before: Any, after: Any) -> None:
     for joint in range(before.njnt):
         old_joint = before.joint(joint)
         new_joint = after.joint(old_joint.name)
-        for name in ("damping", "frictionloss", "armature"):  # of its degrees of freedom
+        for name in ("range", "damping", "frictionloss", "armature"):
             getattr(new_joint, name)[:] = getattr(old_joint, name)
     for actuator in range(before.nu):
         number = after.actuator(before.actuator(actuator).name).id

@@ -8,7 +8,7 @@ frictions of its links, as in PyBullet, and at least 0.001.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 from rlctl.task.attachments import Attachment, Joined
 from rlctl.task.camera import Distractor, Pictures
+from rlctl.task.motors import Motor
 from rlctl.task.mujoco.body import MujocoBody
 from rlctl.task.mujoco.cameras import MOST_DISTRACTORS, CameraPictures, as_row, make_looks
 from rlctl.task.mujoco.drawn_world import DrawnWorld
@@ -65,7 +66,7 @@ class MujocoSim(Sim):
         self.bodies = {}
         self._pushes: list[_MujocoPush] = []
         self._markers: list[Marker] = []
-        self._added: list[Callable[[MujocoScene], Parts]] = []  # what has added each body
+        self._added: list[Callable[[MujocoScene], object]] = []  # what has added each body and each real motor
         self._drawn: list[DrawnWorld] = []  # one, after the first picture of a world without visual shapes
         self._close_cameras()
         self._scene = self._make_scene(visuals=self._visuals)
@@ -179,6 +180,12 @@ class MujocoSim(Sim):
         self._scene.add_force_sensor(joint, link)
         self._compile()
 
+    def add_motors(self, body: str, motors: Mapping[str, Motor]) -> None:
+        """Make motors of a body real ones, by joint."""
+        self._scene.add_motors(body, motors)
+        self._added.append(lambda scene: scene.add_motors(body, motors))
+        self._compile()
+
     def _compile(self) -> None:
         before = self.world.mj_model
         model, data = self._scene.compile(before, self.world.mj_data)
@@ -199,14 +206,17 @@ class MujocoSim(Sim):
         self.world.extra |= {"friction": friction, "spin": spin, "roll": roll}
         self.world.extra["ideal motors"] = make_ideal_motors(model.nu)
         self.world.extra = make_looks(self.cameras) | self.world.extra  # what `build` has set so far stays
-        strength = np.ones(model.nu)
+        strength, encoder_bias = np.ones(model.nu), np.zeros(model.nu)
         color = np.full((model.nbody, 3), np.nan)  # of links, where it was changed
         if "color" in self.world.extra:  # what a task has changed in `build` so far
             for motor in range(before.nu):
-                strength[model.actuator(before.actuator(motor).name).id] = self.world.extra["strength"][motor]
+                number = model.actuator(before.actuator(motor).name).id
+                strength[number] = self.world.extra["strength"][motor]
+                encoder_bias[number] = self.world.extra["encoder bias"][motor]
             for body in range(before.nbody):
                 color[model.body(before.body(body).name).id] = self.world.extra["color"][body]
-        self.world.extra |= {"strength": strength, "color": color}
+        self.world.extra |= {"strength": strength, "color": color, "encoder bias": encoder_bias}
+        self.world.extra["awaits command"] = np.ones(model.nu)
         # Of the compiled model, which sorts pairs.
         self._pair_links = model.geom_bodyid[np.column_stack([model.pair_geom1, model.pair_geom2])]
 
