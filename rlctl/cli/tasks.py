@@ -195,13 +195,32 @@ def new_task(
     tip: Annotated[
         str | None, Option("Link of --model whose origin is between the fingers, if it is not found.", metavar="FRAME")
     ] = None,
+    motion: Annotated[
+        list[str], Option("A clip for --model to follow, .csv or .npz; again for further ones.", metavar="FILE")
+    ] = [],
+    rate: Annotated[
+        float | None, Option("Frames per second of --motion, if they are not in the file.", min=1, metavar="HZ")
+    ] = None,
+    quaternion: Annotated[
+        str | None, Option("Order of the root's quaternion in --motion: xyzw or wxyz.", metavar="ORDER")
+    ] = None,
+    clip_joints: Annotated[
+        str | None, Option("Joints of the columns of --motion, in their order; - for none.", metavar="NAMES")
+    ] = None,
+    frames: Annotated[
+        str | None, Option("Frames of --motion that are taken, such as 120:480.", metavar="FIRST:LAST")
+    ] = None,
     json: Json = None,
 ) -> None:
-    """Create a starter plugin in a folder NAME: a reach, walk or pick task that trains as it is, its recipe, tests."""
+    """Create a starter plugin in a folder NAME: a reach, walk, pick or motion task, its recipe, tests."""
+    from rlctl.tasks.clip_options import ClipOptions
     from rlctl.tasks.new import create, show
 
     hand = [name for name, asked in (("pick", pick), ("place", place), ("push", push)) if asked]
-    show(create(name, model=model, link=link, walk=walk, hand=hand, gripper=gripper, tip=tip), json)
+    names = tuple(part.strip() for part in (clip_joints or "").split(",") if part.strip())
+    clip = ClipOptions(rate=rate, quaternion=quaternion, joints=names, frames=frames)
+    options = {"link": link, "gripper": gripper, "tip": tip}
+    show(create(name, model=model, walk=walk, hand=hand, motions=motion, clip=clip, **options), json)
 
 
 @command
