@@ -106,17 +106,17 @@ def read_motion(path: Path) -> Motion:
 def find_rate(times: Any, where: str) -> float:
     """Return the rate of times [s] at equal distances [1/s]; raises `TaskError` for others."""
     steps = np.diff(times)
-    mean = float(steps.mean())
-    if not mean > 0:
+    usual = float(np.median(steps))
+    if not usual > 0:
         raise TaskError(f"{where}: the times do not rise")
-    uneven = np.abs(steps - mean) > _STEADY * mean + 10.0**-_DECIMALS
-    if uneven.any():
-        row = int(uneven.argmax())
+    off = np.abs(steps - usual)
+    row = int(off.argmax())
+    if off[row] > _STEADY * usual + 10.0**-_DECIMALS:
         raise TaskError(
-            f"{where}: {steps[row]:.4g} s from frame {row} to {row + 1}, and {mean:.4g} s on average; "
+            f"{where}: {steps[row]:.4g} s from frame {row} to {row + 1}, and {usual:.4g} s elsewhere; "
             "resample it at equal times first"
         )
-    rate = 1.0 / mean
+    rate = 1.0 / float(steps.mean())
     return float(round(rate)) if abs(rate - round(rate)) < _STEADY * rate / 10 else rate
 
 

@@ -42,7 +42,8 @@ class Heights:
 def measure_heights(body: MujocoBody, motion: Motion) -> Heights:
     """Return how high the lowest point and the centre of mass of a free body are, which is left in the last frame."""
     mujoco, model, data = body._sim.mujoco, body._sim.model, body._sim.data
-    shapes = Shapes(model, body.parts.geoms)
+    # A floor in the file belongs to the world, 0.
+    shapes = Shapes(model, [geom for geom in body.parts.geoms if int(model.geom_bodyid[geom])])
     root = body.find_link(body.base_name)
     body.set_base((0.0, 0.0, 0.0))
     mujoco.mj_kinematics(model, data)

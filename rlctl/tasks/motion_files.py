@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, TaskError, UsageError, did_you_mean
-from rlctl.storage import untrusted
+from rlctl.storage import files, untrusted
 from rlctl.task.motion import Motion, find_rate
 from rlctl.task.rotations import normalize
 from rlctl.tasks.clip_options import ClipOptions
@@ -197,7 +197,7 @@ def _find_kind(name: str) -> str:
 
 
 def _read_npz(path: Path) -> _Raw:
-    arrays = untrusted.read_arrays(path)
+    arrays = files.read_npz(path)
 
     def find(*names: str) -> tuple[str, Any]:
         for name in names:
@@ -221,7 +221,8 @@ def _read_npz(path: Path) -> _Raw:
         raise UsageError(f"--motion {path}: joints, positions and quaternions of shapes {shapes} do not fit together")
     if frames < _LEAST_FRAMES:
         raise UsageError(f"--motion {path}: {frames} frames; a clip has at least {_LEAST_FRAMES}")
-    raw = _Raw(*(np.asarray(values, np.float64) for values in (position, quaternions, joints)))
+    position, quaternions, joints = (np.asarray(values, np.float64) for values in (position, quaternions, joints))
+    raw = _Raw(position, quaternions, joints)
     if source.startswith("body_"):
         raw.quaternion = "wxyz"
     _, names = find("joint_names", "dof_names")

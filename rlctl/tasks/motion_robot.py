@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.errors import TaskError, UsageError
+from rlctl.errors import UsageError
 from rlctl.task.motion import Motion, write_motion
 from rlctl.tasks.clip_options import ClipOptions
-from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
+from rlctl.tasks.legged_robot import load_free
+from rlctl.tasks.model_copy import copy_model, remove_floor
 from rlctl.tasks.motion_faults import Heights, find_faults, find_shift, measure_heights
 from rlctl.tasks.motion_files import RobotJoints, read_clip
 from rlctl.tasks.scaling import GRAVITY
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 TEMPLATE = Path(__file__).with_name("template_motion")
 """Templates of the files that differ from those of an arm."""
-_CONTROL_DT, _SUBSTEPS = 0.02, 2  # [s], -
+_SUBSTEPS = 2  # per action, each of 10 ms
 _LONGEST = 10.0  # [s], of an episode
 _ENDLESS_FORCE = 20.0  # of weight x height of the root
 _GUESSED = 0.15  # of weight x height of the root, for a joint that carries the robot
@@ -98,26 +99,16 @@ def _put_on_floor(body: MujocoBody, clip: Motion) -> tuple[Motion, list[str]]:
 
 
 def _load(model: str) -> tuple[Path, MujocoBody]:
-    """Load a model with a free base; raises `UsageError`."""
-    from rlctl.task.mujoco.sim import MujocoSim
-
-    path = find_own_model(model)
-    sim = MujocoSim(control_dt=_CONTROL_DT, substeps=_SUBSTEPS)
-    try:
-        body = sim.load("robot", path)
-    except TaskError as error:
-        raise UsageError(f"--model: {error}") from None
+    """Load a robot that a clip can move; raises `UsageError`."""
+    path, body = load_free(model, "--motion")
     if not body.joint_names:
         raise UsageError(f"--model {model}: it has no joints")
     if body.fixed:
         raise UsageError(
             f"--model {model}: its base is fixed, and a clip moves it; add <freejoint/> to the body {body.base_name!r}"
         )
-    sliding = [
-        name
-        for name, joint in zip(body.joint_names, body.parts.joints, strict=True)
-        if int(sim.model.jnt_type[joint]) == _SLIDES
-    ]
+    kinds = body._sim.model.jnt_type[body.parts.joints].tolist()
+    sliding = [name for name, kind in zip(body.joint_names, kinds, strict=True) if kind == _SLIDES]
     if sliding:
         raise UsageError(f"--model {model}: joint {sliding[0]!r} slides; --motion needs joints that rotate")
     return path, body
