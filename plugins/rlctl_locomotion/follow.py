@@ -1,6 +1,6 @@
 """Follow: robots that follow a clip from any frame to its end; a bow with a squat of the humanoid, a bow of the A1."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,9 +28,9 @@ def read_reference(clip: str, joints: list[str]) -> Reference:
     return Reference([read_motion(CLIPS / f"{clip}.csv")], joints, CONTROL_DT)
 
 
-def list_terms(reference: Reference) -> Mapping[str, terms.Term]:
+def list_terms(reference: Reference) -> dict[str, terms.Term]:
     """Return what is observed: what the robot measures, and what the clip wants next."""
-    tables = reference.tabulate()
+    tables = {name: table.tolist() for name, table in reference.tabulate().items()}
     return {
         "gravity": terms.Gravity("orientation"),
         "joint_error": terms.Playback(tables["joints"], CONTROL_DT, "joint_positions"),
@@ -40,7 +40,7 @@ def list_terms(reference: Reference) -> Mapping[str, terms.Term]:
     }
 
 
-def mirror_clip(other_side: tuple[int, ...]) -> Mapping[str, tuple[int, ...]]:
+def mirror_clip(other_side: tuple[int, ...]) -> dict[str, Sequence[int]]:
     """Return the mirror image of a robot, whose joints `other_side` exchanges, and of what its clip wants."""
     count = len(other_side)
     # After the speeds of the joints: the direction of gravity, the velocity, the turning, and the height.

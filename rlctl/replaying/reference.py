@@ -13,8 +13,8 @@ REFERENCE = "reference"
 def check_has_reference(spec: EnvSpec) -> None:
     """Raise `UsageError` for a task that follows no clip."""
     cls = spec.constructor()
-    is_batch = isinstance(cls, type) and issubclass(cls, BatchTask)
-    if not is_batch or cls.place_reference is BatchTask.place_reference:
+    place = cls.place_reference if isinstance(cls, type) and issubclass(cls, BatchTask) else None
+    if place is None or place is BatchTask.place_reference:
         raise UsageError(
             f"--policy {REFERENCE}: {spec.task} follows no clip; rlctl tasks new NAME --model FILE --motion CLIP "
             "makes a task that does, and a BatchTask of your own needs place_reference()"

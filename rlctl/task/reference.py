@@ -56,11 +56,11 @@ class Reference:
             if len(clip) < 3:
                 raise TaskError(f"motion {clip.name}: {clip.duration:.3g} s, less than two control steps")
         lengths = [len(clip) for clip in clips]
-        self.ends = np.cumsum(lengths) - 1
+        self.ends: Rows = np.cumsum(lengths) - 1
         """The last row of each clip."""
-        self.starts = self.ends - lengths + 1
-        self.clip_of = np.repeat(np.arange(len(clips)), lengths)
-        self.following = np.minimum(np.arange(sum(lengths)) + 1, self.ends[self.clip_of])
+        self.starts: Rows = self.ends - lengths + 1
+        self.clip_of: Rows = np.repeat(np.arange(len(clips)), lengths)
+        self.following: Rows = np.minimum(np.arange(sum(lengths)) + 1, self.ends[self.clip_of])
         """The row after each row; the last row of a clip follows itself."""
         self.joint_positions = np.concatenate([clip.take_joints(joint_order) for clip in clips])
         self.joint_velocities = self._differentiate(self.joint_positions)

@@ -247,7 +247,7 @@ class Playback(Term):
     one, and then the time, shape (1,) [s].
     """
 
-    table: tuple[Numbers, ...]
+    table: Sequence[Sequence[float]]
     dt: float
     quantity: str = ""
     time: str = ""

@@ -148,7 +148,7 @@ def _judge_falls(motion: Motion, centre: Array) -> list[str]:
     ]
 
 
-def _list_joints(names: Sequence[str], bad: Array, values: Array, form: str) -> str:
+def _list_joints(names: Sequence[str], bad: Any, values: Array, form: str) -> str:
     columns = np.flatnonzero(bad.any(axis=0))
     worst = sorted(columns.tolist(), key=lambda column: -float(values[:, column].max()))
     texts = [form.format(names[column], float(values[:, column].max())) for column in worst[:_MOST_NAMES]]
