@@ -63,7 +63,7 @@ CASES = {
     ),
     "ppo, levels, on worlds in batches": (STOOL, settings("ppo", **LEVELS)),
     "ppo, levels that the task chooses": (
-        "quadruped-bow",
+        "rlctl_locomotion.follow:QuadrupedBow",
         settings("ppo", task={"episode_s": 0.4, "tolerance": 0.0}, stages=[{"level": {"start": 1.0}}]),
     ),
     "sac, levels": (STOOL, settings("sac", **LEVELS)),
