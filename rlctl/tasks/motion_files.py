@@ -341,8 +341,11 @@ def _guess_names(path: Path, raw: _Raw, joints: RobotJoints) -> tuple[list[str],
     if names == other_names:
         return names, f"joints in the order of {joints.file}"
     if others < outside:
-        return other_names, f"joint order {second}: {others} values beyond the limits, {outside} in {first} order"
-    return names, f"joint order {first}: {outside} values beyond the limits, {others} {second}"
+        names, found = other_names, f"joint order {second}: {others} values beyond the limits, {outside} in {first} order"
+    else:
+        found = f"joint order {first}: {outside} values beyond the limits, {others} {second}"
+    advice = "; if it is another one, give it with --clip-joints" if min(others, outside) else ""
+    return names, found + advice
 
 
 def _match_names(path: Path, names: Sequence[str], joints: RobotJoints) -> Mapping[str, int]:

@@ -31,7 +31,7 @@ TEMPLATE = Path(__file__).with_name("template_motion")
 _SUBSTEPS = 2  # per action, each of 10 ms
 _LONGEST = 10.0  # [s], of an episode
 _ENDLESS_FORCE = 20.0  # of weight x height of the root
-_GUESSED = 0.15  # of weight x height of the root, for a joint that carries the robot
+_GUESSED = 0.35  # of weight x height of the root, for a joint that carries the robot
 _HELD = 3.0  # times the torque of gravity on what a joint moves, for one that does not
 _MOTOR = 4000.0  # [1/s^2]: torque limit by inertia of a motor and its gears, where the model has none
 _FARTHEST = 0.33  # of the height of the root
@@ -151,7 +151,7 @@ def _find_forces(body: MujocoBody, clip: Motion, size: float) -> tuple[Array, ND
     for index, joint in enumerate(body.parts.joints):
         link = int(model.jnt_bodyid[joint])
         moved = float(model.body_subtreemass[link]) * GRAVITY
-        is_arm = moved < 0.1 * weight and not _is_lowest(body, link, clip, size)
+        is_arm = moved < 0.15 * weight and not _is_lowest(body, link, clip, size)
         guesses[index] = _HELD * moved * 0.3 * size if is_arm else _GUESSED * weight * size
     rounded = np.array([float(f"{guess:.2g}") for guess in guesses])
     return np.where(are_guessed, rounded, limits), are_guessed
