@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files, untrusted
-from rlctl.task.motion import Motion, find_rate
+from rlctl.task.motion import Clip, find_rate
 from rlctl.task.rotations import normalize
 from rlctl.tasks.clip_options import ClipOptions
 
@@ -68,7 +68,7 @@ class RobotJoints:
     rest: Array  # positions of joints that a clip lacks
 
 
-def read_clip(file: str, joints: RobotJoints, options: ClipOptions) -> tuple[Motion, list[str]]:
+def read_clip(file: str, joints: RobotJoints, options: ClipOptions) -> tuple[Clip, list[str]]:
     """Read a clip as a motion of all joints of a robot, in the model's order; return it with what was found.
 
     Raises `UsageError` for a file that is missing, damaged, or does not fit the robot.
@@ -83,7 +83,7 @@ def read_clip(file: str, joints: RobotJoints, options: ClipOptions) -> tuple[Mot
     rate, source = _choose_rate(path, raw, options)
     positions, found = _order_joints(path, raw, joints, options)
     columns = [order.index(axis) for axis in "xyzw"]
-    motion = Motion(
+    motion = Clip(
         name=path.stem,
         rate=rate,
         root_position=raw.root_position,
@@ -341,7 +341,10 @@ def _guess_names(path: Path, raw: _Raw, joints: RobotJoints) -> tuple[list[str],
     if names == other_names:
         return names, f"joints in the order of {joints.file}"
     if others < outside:
-        names, found = other_names, f"joint order {second}: {others} values beyond the limits, {outside} in {first} order"
+        names, found = (
+            other_names,
+            f"joint order {second}: {others} values beyond the limits, {outside} in {first} order",
+        )
     else:
         found = f"joint order {first}: {outside} values beyond the limits, {others} {second}"
     advice = "; if it is another one, give it with --clip-joints" if min(others, outside) else ""

@@ -37,6 +37,4 @@ def test_a_task_without_a_clip():
     with pytest.raises(UsageError, match="--policy reference: walk follows no clip; rlctl tasks new NAME --model FILE"):
         run_replay(ReplayRequest("walk", baseline="reference"))
     with pytest.raises(UsageError, match="leave out --worst"):
-        run_replay(
-            ReplayRequest("rlctl_locomotion.follow:QuadrupedBow", baseline="reference", worst=1)
-        )
+        run_replay(ReplayRequest("rlctl_locomotion.follow:QuadrupedBow", baseline="reference", worst=1))
