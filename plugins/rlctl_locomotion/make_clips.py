@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.task.motion import Clip, write_motion
+from rlctl.task.motion import MotionClip, write_motion
 from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.rotations import from_axis, rotate
 from rlctl_locomotion.humanoid_walk import JOINTS as HUMANOID_JOINTS
@@ -60,7 +60,7 @@ def blend(keys: Sequence[Sequence[float]]) -> np.ndarray:
     return rows
 
 
-def make_humanoid_bow() -> Clip:
+def make_humanoid_bow() -> MotionClip:
     """Return a bow and a squat of the humanoid."""
     body = MujocoSim(control_dt=0.02, substeps=1).load("robot", HumanoidWalk.model)
     data, trunk = body._sim.data, body.find_link(body.base_name)
@@ -90,7 +90,7 @@ def make_humanoid_bow() -> Clip:
     return _collect("humanoid-bow", HUMANOID_JOINTS, blend(HUMANOID_KEYS), balance)
 
 
-def make_quadruped_bow() -> Clip:
+def make_quadruped_bow() -> MotionClip:
     """Return a bow of the A1, and the opposite."""
     import mujoco
 
@@ -124,10 +124,10 @@ def make_quadruped_bow() -> Clip:
 
 def _collect(
     name: str, joints: Sequence[str], rows: np.ndarray, place: Callable[[Sequence[float]], tuple[Any, Any, Any, float]]
-) -> Clip:
+) -> MotionClip:
     placed = [place(row) for row in rows.tolist()]
     positions, turns, angles = (np.array([frame[part] for frame in placed]) for part in range(3))
-    return Clip(name, RATE, positions, turns, list(joints), angles)
+    return MotionClip(name, RATE, positions, turns, list(joints), angles)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`Clip`: a clip that a robot is to follow, as rows of time. Its file is a CSV table with a header and units.
+"""`MotionClip`: a clip that a robot is to follow, as rows of time. Its file is a CSV table with a header and units.
 
 The columns of a file are `time` [s], `root_x`, `root_y`, `root_z` [m], `root_qx`, `root_qy`, `root_qz`, `root_qw`, and
 one per joint, [rad] or [m], named as the joint. Clips of other forms become such files by `rlctl tasks new --motion`.
@@ -26,7 +26,7 @@ _DECIMALS = 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Clip:
+class MotionClip:
     """A clip: a root, which is the base of the robot, and joints, in rows of equal time."""
 
     name: str
@@ -44,7 +44,7 @@ class Clip:
         """Time from the first frame to the last [s]."""
         return (len(self) - 1) / self.rate
 
-    def resample(self, rate: float) -> "Clip":
+    def resample(self, rate: float) -> "MotionClip":
         """Return the clip at another rate [1/s], linear between its frames, without what is left after the last row."""
         if rate == self.rate:
             return self
@@ -79,7 +79,7 @@ def align_signs(quaternions: Array) -> Array:
     return quaternions * np.concatenate([[1.0], signs])[:, None]
 
 
-def read_motion(path: Path) -> Clip:
+def read_motion(path: Path) -> MotionClip:
     """Read the file of a clip; raises `TaskError` or `ArtifactError` for a file without the columns."""
     header, *lines = untrusted.read_bytes(path).decode(errors="replace").splitlines() or [""]
     names = [name.strip() for name in header.split(",")]
@@ -93,7 +93,7 @@ def read_motion(path: Path) -> Clip:
         raise TaskError(f"{path.name}: expected at least 2 rows of {len(names)} finite numbers")
     columns = {name: rows[:, index] for index, name in enumerate(names)}
     joints = [name for name in names if name not in (TIME, *ROOT)]
-    return Clip(
+    return MotionClip(
         name=path.stem,
         rate=find_rate(columns[TIME], path.name),
         root_position=np.column_stack([columns[name] for name in POSITION]),
@@ -120,7 +120,7 @@ def find_rate(times: Any, where: str) -> float:
     return float(round(rate)) if abs(rate - round(rate)) < _STEADY * rate / 10 else rate
 
 
-def write_motion(motion: Clip) -> bytes:
+def write_motion(motion: MotionClip) -> bytes:
     """Return a clip as the content of its file."""
     columns = [np.arange(len(motion)) / motion.rate, *motion.root_position.T, *motion.root_orientation.T]
     rows = np.column_stack([*columns, motion.joint_positions])

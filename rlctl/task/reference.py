@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError
 from rlctl.task.batch import WorldRngs
-from rlctl.task.motion import Clip, align_signs
+from rlctl.task.motion import MotionClip, align_signs
 from rlctl.task.rotations import from_axis, invert, multiply, rotate, rotate_inverse
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ class Reference:
     least: ClassVar[float] = 0.5
     """[s], so long before the end of a clip the last start is."""
 
-    def __init__(self, motions: Sequence[Clip], joint_order: Sequence[str], control_dt: float) -> None:
+    def __init__(self, motions: Sequence[MotionClip], joint_order: Sequence[str], control_dt: float) -> None:
         self.control_dt, self.names = control_dt, [motion.name for motion in motions]
         clips = [motion.resample(1.0 / control_dt) for motion in motions]
         for clip in clips:

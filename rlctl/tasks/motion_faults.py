@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.task.motion import Clip
+from rlctl.task.motion import MotionClip
 from rlctl.task.rotations import invert, multiply
 from rlctl.tasks.shapes import Shapes
 
@@ -39,7 +39,7 @@ class Heights:
     centre: Array  # [m], of the centre of mass, shape (frames,)
 
 
-def measure_heights(body: MujocoBody, motion: Clip) -> Heights:
+def measure_heights(body: MujocoBody, motion: MotionClip) -> Heights:
     """Return how high the lowest point and the centre of mass of a free body are, which is left in the last frame."""
     mujoco, model, data = body._sim.mujoco, body._sim.model, body._sim.data
     # A floor in the file belongs to the world, 0.
@@ -66,7 +66,7 @@ def find_shift(heights: Heights) -> float:
     return shift if 0.002 < abs(shift) <= _MOST_SHIFT else 0.0
 
 
-def find_faults(body: MujocoBody, motion: Clip, heights: Heights) -> list[str]:
+def find_faults(body: MujocoBody, motion: MotionClip, heights: Heights) -> list[str]:
     """Return sentences without a full stop, each with the frames, counted from 0."""
     faults = [
         *_judge_floor(heights.lowest),
@@ -87,7 +87,7 @@ def _judge_floor(lowest: Array) -> list[str]:
     return []
 
 
-def _judge_limits(body: MujocoBody, motion: Clip) -> list[str]:
+def _judge_limits(body: MujocoBody, motion: MotionClip) -> list[str]:
     positions, low, high = motion.joint_positions, body.joint_low, body.joint_high
     beyond = np.maximum(np.maximum(low - positions, positions - high), 0.0)
     bad = beyond > _BESIDE
@@ -100,7 +100,7 @@ def _judge_limits(body: MujocoBody, motion: Clip) -> list[str]:
     return [f"beyond the limits of the model: {found}"]
 
 
-def _judge_speeds(body: MujocoBody, motion: Clip) -> list[str]:
+def _judge_speeds(body: MujocoBody, motion: MotionClip) -> list[str]:
     speeds = np.abs(np.gradient(motion.joint_positions, 1.0 / motion.rate, axis=0))
     known = body.joint_max_speed
     limits = np.where((known > 0) & np.isfinite(known), known, _FASTEST)
@@ -114,7 +114,7 @@ def _judge_speeds(body: MujocoBody, motion: Clip) -> list[str]:
     return [f"faster than the motors: {found}{advice}"]
 
 
-def _judge_jumps(motion: Clip) -> list[str]:
+def _judge_jumps(motion: MotionClip) -> list[str]:
     joints = np.abs(np.diff(motion.joint_positions, axis=0)).max(axis=1, initial=0.0) * motion.rate
     root = np.linalg.norm(np.diff(motion.root_position, axis=0), axis=1) * motion.rate
     turns = multiply(motion.root_orientation[1:], invert(motion.root_orientation[:-1]))
@@ -130,7 +130,7 @@ def _judge_jumps(motion: Clip) -> list[str]:
     ]
 
 
-def _judge_falls(motion: Clip, centre: Array) -> list[str]:
+def _judge_falls(motion: MotionClip, centre: Array) -> list[str]:
     """Nothing pulls a robot down but gravity, so a centre of mass that falls faster is played too fast, or jumps."""
     window = max(1, round(_WINDOW * motion.rate))
     if len(centre) < 3 * window:

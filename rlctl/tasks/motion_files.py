@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files, untrusted
-from rlctl.task.motion import Clip, find_rate
+from rlctl.task.motion import MotionClip, find_rate
 from rlctl.task.rotations import normalize
 from rlctl.tasks.clip_options import ClipOptions
 
@@ -68,7 +68,7 @@ class RobotJoints:
     rest: Array  # positions of joints that a clip lacks
 
 
-def read_clip(file: str, joints: RobotJoints, options: ClipOptions) -> tuple[Clip, list[str]]:
+def read_clip(file: str, joints: RobotJoints, options: ClipOptions) -> tuple[MotionClip, list[str]]:
     """Read a clip as a motion of all joints of a robot, in the model's order; return it with what was found.
 
     Raises `UsageError` for a file that is missing, damaged, or does not fit the robot.
@@ -83,7 +83,7 @@ def read_clip(file: str, joints: RobotJoints, options: ClipOptions) -> tuple[Cli
     rate, source = _choose_rate(path, raw, options)
     positions, found = _order_joints(path, raw, joints, options)
     columns = [order.index(axis) for axis in "xyzw"]
-    motion = Clip(
+    motion = MotionClip(
         name=path.stem,
         rate=rate,
         root_position=raw.root_position,

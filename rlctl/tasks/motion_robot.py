@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
-from rlctl.task.motion import Clip, write_motion
+from rlctl.task.motion import MotionClip, write_motion
 from rlctl.tasks.clip_options import ClipOptions
 from rlctl.tasks.legged_robot import load_free
 from rlctl.tasks.model_copy import copy_model, remove_floor
@@ -44,7 +44,7 @@ _MOST_LINKS = 16
 class _Follower:
     body: MujocoBody
     path: Path
-    clips: list[Clip]
+    clips: list[MotionClip]
     links: list[str]
     forces: Array  # [N m]
     are_guessed: NDArray[np.bool_]
@@ -65,7 +65,7 @@ def read_motion_robot(model: str, motions: Sequence[str], options: ClipOptions) 
     joints = _describe_joints(body)
     read = [read_clip(motion, joints, options) for motion in motions]
     notes = [note for _, found in read for note in found]
-    clips: list[Clip] = []
+    clips: list[MotionClip] = []
     for clip, _ in read:
         standing, found = _put_on_floor(body, clip)
         clips.append(standing)
@@ -85,7 +85,7 @@ def read_motion_robot(model: str, motions: Sequence[str], options: ClipOptions) 
     return StarterRobot(_describe(follower), files, _summarize(follower, notes), template=TEMPLATE, kept=kept)
 
 
-def _put_on_floor(body: MujocoBody, clip: Clip) -> tuple[Clip, list[str]]:
+def _put_on_floor(body: MujocoBody, clip: MotionClip) -> tuple[MotionClip, list[str]]:
     """Return the clip at the height at which the robot stands on the floor, and what was found in it."""
     heights, notes = measure_heights(body, clip), []
     shift = find_shift(heights)
@@ -128,9 +128,9 @@ def _describe_joints(body: MujocoBody) -> RobotJoints:
     return RobotJoints(body.file.name, names, [names[index] for index in order], low, high, rest)
 
 
-def _name_clips(clips: list[Clip]) -> list[Clip]:
+def _name_clips(clips: list[MotionClip]) -> list[MotionClip]:
     """Return clips with names of files that differ."""
-    named: list[Clip] = []
+    named: list[MotionClip] = []
     for clip in clips:
         plain = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in clip.name) or "clip"
         name, number = plain, 1
@@ -141,7 +141,7 @@ def _name_clips(clips: list[Clip]) -> list[Clip]:
     return named
 
 
-def _find_forces(body: MujocoBody, clip: Clip, size: float) -> tuple[Array, NDArray[np.bool_]]:
+def _find_forces(body: MujocoBody, clip: MotionClip, size: float) -> tuple[Array, NDArray[np.bool_]]:
     """Return the torque limits of all joints [N m], and which of them are guesses."""
     model = body._sim.model
     weight = body.total_mass() * GRAVITY
@@ -157,7 +157,7 @@ def _find_forces(body: MujocoBody, clip: Clip, size: float) -> tuple[Array, NDAr
     return np.where(are_guessed, rounded, limits), are_guessed
 
 
-def _is_lowest(body: MujocoBody, link: int, clip: Clip, size: float) -> bool:
+def _is_lowest(body: MujocoBody, link: int, clip: MotionClip, size: float) -> bool:
     """Return whether a link is in a leg: lower than half of the root's height in the last frame that was placed."""
     return float(body._sim.data.xpos[link, 2]) < 0.6 * size
 

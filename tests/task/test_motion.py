@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from rlctl.errors import TaskError
-from rlctl.task.motion import Clip, find_rate, read_motion, write_motion
+from rlctl.task.motion import MotionClip, find_rate, read_motion, write_motion
 from rlctl.task.rotations import from_axis
 
 
-def make_motion(frames: int = 5, rate: float = 10.0) -> Clip:
+def make_motion(frames: int = 5, rate: float = 10.0) -> MotionClip:
     """A clip that moves 0.1 m forwards, turns 0.2 rad to the left and bends one of two joints by 0.1 rad a frame."""
     numbers = np.arange(float(frames))
-    return Clip(
+    return MotionClip(
         name="clip",
         rate=rate,
         root_position=np.stack([0.1 * numbers, 0 * numbers, 0 * numbers + 0.3], axis=1),

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rlctl.task.motion import Clip
+from rlctl.task.motion import MotionClip
 from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.rotations import from_axis
 from rlctl.tasks.motion_faults import find_faults, find_shift, list_frames, measure_heights
@@ -24,7 +24,7 @@ def dog(tmp_path_factory):
 def clip(dog):
     """A dog that stands still on its feet."""
     joints = np.tile(BENT, (FRAMES, 1))
-    motion = Clip(
+    motion = MotionClip(
         name="clip",
         rate=RATE,
         root_position=np.tile([0.0, 0.0, STANDING], (FRAMES, 1)),
