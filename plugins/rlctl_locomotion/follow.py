@@ -96,6 +96,7 @@ class Follow(Driven):
     }
     events = {
         **Driven.events,
+        "position_noise": Event("observation", events.noise, of="joint_error", std=(0.0, 0.01)),  # [rad]
         "push": Event("interval", events.kick, every_s=3.0, body="robot", speed=(0.0, 0.4)),  # [m/s]
     }
     rlctl_ignore = {
