@@ -99,7 +99,7 @@ def read_motion(path: Path) -> MotionClip:
         root_position=np.column_stack([columns[name] for name in POSITION]),
         root_orientation=normalize(np.column_stack([columns[name] for name in ORIENTATION])),
         joint_names=joints,
-        joint_positions=np.column_stack([columns[name] for name in joints]) if joints else np.zeros((len(rows), 0)),
+        joint_positions=rows[:, [names.index(name) for name in joints]],
     )
 
 

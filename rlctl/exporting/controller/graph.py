@@ -180,9 +180,10 @@ class _Writer:
 
     def _add_reference(self, playback: Playback) -> str:
         """Add the row of a clip that a target corrects."""
-        time = (
-            GraphSymbol(self._graph, self._read(self._inputs[playback.time]), 1) if playback.time else self._read_time()
-        )
+        if playback.time:
+            time = GraphSymbol(self._graph, self._read(self._inputs[playback.time]), 1)
+        else:
+            time = self._read_time()
         (row,) = playback.compute(time)
         return str(row.value)
 
