@@ -201,12 +201,30 @@ def new_task(
     backlash: Annotated[
         str | None, Option("Play of the gears of --motors, from end to end: 1deg or 0.02rad.", metavar="ANGLE")
     ] = None,
+    motion: Annotated[
+        list[str], Option("A clip for --model to follow, .csv or .npz; again for further ones.", metavar="FILE")
+    ] = [],
+    rate: Annotated[
+        float | None, Option("Frames per second of --motion, if they are not in the file.", min=1, metavar="HZ")
+    ] = None,
+    quaternion: Annotated[
+        str | None, Option("Order of the root's quaternion in --motion: xyzw or wxyz.", metavar="ORDER")
+    ] = None,
+    clip_joints: Annotated[
+        str | None, Option("Joints of the columns of --motion, in their order; - for none.", metavar="NAMES")
+    ] = None,
+    frames: Annotated[
+        str | None, Option("Frames of --motion that are taken, such as 120:480.", metavar="FIRST:LAST")
+    ] = None,
     json: Json = None,
 ) -> None:
-    """Create a starter plugin in a folder NAME: a reach, walk or pick task that trains as it is, its recipe, tests."""
+    """Create a starter plugin in a folder NAME: a reach, walk, pick or motion task, its recipe, tests."""
+    from rlctl.tasks.clip_options import ClipOptions
     from rlctl.tasks.new import create, show
 
     hand = [name for name, asked in (("pick", pick), ("place", place), ("push", push)) if asked]
+    names = tuple(part.strip() for part in (clip_joints or "").split(",") if part.strip())
+    clip = ClipOptions(rate=rate, quaternion=quaternion, joints=names, frames=frames)
     plugin = create(
         name,
         model=model,
@@ -217,6 +235,8 @@ def new_task(
         tip=tip,
         motors=motors,
         backlash=backlash,
+        motions=motion,
+        clip=clip,
     )
     show(plugin, json)
 

@@ -54,6 +54,10 @@ class GymWorlds:
         self.info = info
         return self._writer.read(observation)
 
+    def next_level(self, world: int) -> float | None:
+        """Return the level of the next episode of a task that chooses it; None otherwise."""
+        return None if self.task_worlds is None else self.task_worlds.next_level(0)
+
     def shorten(self, worlds: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Truncate the next episode of a task after so many steps; a plain environment has a time limit of its own."""
         if self.task_worlds is not None:

@@ -28,6 +28,7 @@ from rlctl.task.terms import (
     Gravity,
     LastAction,
     PhaseClock,
+    Playback,
     Scaled,
     find_quantity_sizes,
 )
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
     from rlctl.task.worlds import TaskWorlds
 
 AnyTerm = Annotated[
-    Scaled | Gravity | Euler | Displacement | Distance | LastAction | PhaseClock, pydantic.Field(discriminator="kind")
+    Scaled | Gravity | Euler | Displacement | Distance | LastAction | PhaseClock | Playback,
+    pydantic.Field(discriminator="kind"),
 ]
 _SHOWN_JOINTS = 8
 _ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box

@@ -61,6 +61,11 @@ class EnvSpec:
         """Import the environment's constructor; raises `ArtifactError` if a file names anything else."""
         return named_task.load(self.task, self.named_by) if self.named_by else load(self.task)
 
+    def as_deployed(self) -> EnvSpec:
+        """Return the task as a robot has it, with its `deployed_parameters`; a plain environment is unchanged."""
+        deployed = getattr(self.constructor(), "deployed_parameters", {})
+        return dataclasses.replace(self, parameters={**self.parameters, **deployed}) if deployed else self
+
     def make(
         self,
         render_mode: Literal["human", "rgb_array", "ansi"] | None = None,

@@ -14,7 +14,10 @@ def fill_in(limits: Limits, info: EnvInfo, reader: ObservationReader) -> Limits:
     """Return the limits with the command and the measured positions that the task describes, where they have none."""
     joints, (_, space) = info.joints, info.spaces()
     is_described = joints is not None and len(joints.names) == math.prod(space.shape or ())
-    command = limits.command or (joints.command[0] if joints is not None and is_described else "") or "action"
+    described = joints.command[0] if joints is not None and is_described else ""
+    if described == "correction":
+        described = ""  # what it corrects moves, so the filter sees actions only
+    command = limits.command or described or "action"
     position = limits.measured.position
     if position is None and command in _USE_POSITIONS:
         position = find_positions(info, reader)

@@ -286,8 +286,7 @@ class _Segment(Actor):
         if asked.levels is not None:
             for result in results:
                 if not arrays.limit[result.env]:
-                    level = float(arrays.level[result.env])
-                    arrays.level[result.env] = asked.levels.follow(level, result.success)
+                    arrays.level[result.env] = self._find_next_level(asked.levels, result)
         arrays.limit[envs] = 0  # only the first episodes are short
         self._rows[ended] = row + 1
         shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
@@ -295,6 +294,12 @@ class _Segment(Actor):
             segment.observation[key][row + 1, ended] = part
         self._episodes.begin_rows(self._actor, ended)
         self._episodes.begin_rows(self._episodes.teacher, ended)
+
+    def _find_next_level(self, rule: messages.LevelRule, result: EpisodeResult) -> float:
+        own = self._worlds.next_level(result.env - self._first)
+        if own is not None:
+            return float(own)
+        return rule.follow(float(self._arrays.level[result.env]), result.success)
 
     def _summarize(self, world: int) -> EpisodeResult:
         totals = self._worlds.totals(world)

@@ -31,7 +31,7 @@ class ReplayRequest:
     baseline: Annotated[
         str | None,
         Option(
-            "Play a TASK, before any training: zero, random, PATH.py:FUNCTION, MODULE:FUNCTION, or a policy server.",
+            "Play a TASK, before any training: zero, random, reference (its clip), FILE.py:FUNCTION, or a server.",
             ("--policy",),
             metavar="POLICY",
         ),

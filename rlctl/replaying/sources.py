@@ -34,6 +34,7 @@ from rlctl.replaying.recorder import (
     play_episode,
     recorded_actions,
 )
+from rlctl.replaying.reference import REFERENCE, check_has_reference, show_reference
 from rlctl.replaying.replay_request import ReplayRequest
 from rlctl.replaying.report import ReplayedEpisode, ReplayResult
 from rlctl.replaying.reproduce import print_warning, record_episode, write_recording
@@ -195,12 +196,22 @@ class PolicySource(_NewEpisodes):
 
 
 class TaskSource(_NewEpisodes):
-    """Episodes of a task with zero or random actions, or a user's function; the world of the first is summarised."""
+    """Episodes of a task with zero or random actions, or a user's function; the world of the first is summarised.
+
+    Of a task that follows a clip, the policy `reference` shows the clip: bodies are placed after every step. Nobody can
+    play these episodes again, so only their recordings are written.
+    """
 
     def __init__(self, request: ReplayRequest, policy: str) -> None:
-        spec = _read_changes(request).apply(choose_task(request.source, policy, "replay"))
-        self._baseline = load_baseline(policy)
-        self.name = self.described = self._baseline.title
+        spec = choose_task(request.source, policy, "replay")
+        self._is_reference = policy == REFERENCE
+        if self._is_reference:
+            _check_reference(request)
+            check_has_reference(spec)
+            spec = spec.as_deployed()
+        spec = _read_changes(request).apply(spec)
+        self._baseline = Baseline("zero") if self._is_reference else load_baseline(policy)
+        self.name = self.described = REFERENCE if self._is_reference else self._baseline.title
         self._other_clients = find_clients()
         self._actor: Actor | None = None
         self._world: WorldWatch | None = None
@@ -209,6 +220,8 @@ class TaskSource(_NewEpisodes):
     def begin(self, env: Env, seed: int) -> Choose:
         """Return the function that chooses the actions of an episode."""
         self._env, self._seed = env, seed
+        if self._is_reference:
+            show_reference(env)
         actor = self._actor = self._actor or self._baseline.make_actor(env)
         actor.begin(Rows.one(seed))
         longest = _LONGEST if describe(env).max_steps is None else None
@@ -241,13 +254,33 @@ class TaskSource(_NewEpisodes):
             return result
         return dataclasses.replace(result, world=self._world.summarize())
 
+    def record_rollout(self, number: int, rollout: Rollout) -> ReplayedEpisode:
+        """Write the recording, and the episode unless it shows a clip."""
+        if not self._is_reference:
+            return super().record_rollout(number, rollout)
+        from rlctl.replaying.rrd import write_rrd
+
+        recording = self._output or self._find_default(number).with_suffix(".rrd")
+        if recording.suffix != ".rrd":
+            recording /= self._find_default(number).with_suffix(".rrd").name
+        write_rrd(recording, rollout, title=f"{self.spec.task} / {REFERENCE}", warn=print_warning)
+        return summarize(rollout, recording)
+
     def _save_by_default(self, number: int, episode: RecordedEpisode) -> Path:
         """Write `./TASK-POLICY.npz`, which the next look replaces; `-2`, `-3` for further episodes."""
-        policy = "server" if self.name.startswith(SERVER) else make_slug(self.name)
-        count = f"-{number + 1}" if number else ""
-        file = Path(f"{make_slug(self.spec.task)}-{policy}{count}.npz")
+        file = self._find_default(number)
         save_episode(file, episode)
         return file
+
+    def _find_default(self, number: int) -> Path:
+        policy = "server" if self.name.startswith(SERVER) else make_slug(self.name)
+        count = f"-{number + 1}" if number else ""
+        return Path(f"{make_slug(self.spec.task)}-{policy}{count}.npz")
+
+
+def _check_reference(request: ReplayRequest) -> None:
+    if request.choice is not None:
+        raise UsageError("--policy reference shows a clip: leave out --worst, --best and --failures")
 
 
 @contextlib.contextmanager

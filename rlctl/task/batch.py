@@ -72,6 +72,27 @@ class BatchTask(TaskDefinition):
         """Return whether the episode ends, shape (worlds,). Optional."""
         return np.zeros(self.worlds, bool)
 
+    def is_truncated(self) -> Any:
+        """Return whether the episode ends before its time limit, as it would at the limit, shape (worlds,). Optional.
+
+        So ends a task whose episodes differ in length, such as a clip that starts anywhere: the states after it would
+        be as good as those before it, which `is_terminated` denies.
+        """
+        return np.zeros(self.worlds, bool)
+
+    def next_levels(self) -> Any:
+        """Return the level of the episode that follows in each world, within [0, 1], shape (worlds,). Optional.
+
+        Read in worlds whose episode has ended, in stages whose level follows success; None: it rises and falls.
+        """
+        return None
+
+    def place_reference(self) -> None:
+        """Put the bodies of all worlds where the clip that the task follows has them now. Optional.
+
+        `rlctl replay TASK --policy reference` calls it after the physics of every step.
+        """
+
     def markers(self) -> dict[str, NDArray[np.float64]]:
         """Return points to draw: name -> world positions of shape (worlds, 3) [m]. Optional."""
         return {}

@@ -33,6 +33,8 @@ class TaskCalls(Protocol):
     """The methods of a task for n worlds; all arrays have a leading axis."""
 
     has_success: bool
+    has_end: bool
+    """Whether episodes may end before the time limit without being terminated."""
 
     def build(self, sim: Any) -> None:
         """Build the world."""
@@ -65,6 +67,12 @@ class TaskCalls(Protocol):
     def is_terminated(self) -> Flags:
         """Return where episodes end, shape (n,)."""
 
+    def is_truncated(self) -> Flags:
+        """Return where episodes end although their state is as good as any, shape (n,)."""
+
+    def next_level(self, world: int) -> float | None:
+        """Return the level of the episode after one that has ended; None if the task does not choose it."""
+
     def is_success(self) -> Flags:
         """Return where the goal is reached, shape (n,)."""
 
@@ -88,6 +96,7 @@ class OneWorldCalls:
         self.task = task
         self.name = type(task).__name__
         self.has_success = type(task).is_success is not Task.is_success
+        self.has_end = False
         self._is_discrete = isinstance(task.action_space, spaces.Discrete)
 
     def build(self, sim: Any) -> None:
@@ -160,6 +169,14 @@ class OneWorldCalls:
         """Return whether the episode ends, shape (1,)."""
         return self._read_flag("is_terminated", self.task.is_terminated())
 
+    def is_truncated(self) -> Flags:
+        """Return False: only the time limit truncates the episodes of a `Task`."""
+        return ONE_FLAG[False]
+
+    def next_level(self, world: int) -> float | None:
+        """Return None: the level follows success."""
+        return None
+
     def is_success(self) -> Flags:
         """Return whether the goal is reached, shape (1,)."""
         return self._read_flag("is_success", self.task.is_success())
@@ -207,6 +224,7 @@ class ManyWorldCalls:
         self.task, self._worlds = task, worlds
         self.name = type(task).__name__
         self.has_success = type(task).is_success is not BatchTask.is_success
+        self.has_end = type(task).is_truncated is not BatchTask.is_truncated
         self._sizes: dict[str, int | None] = {}  # elements of each part of the first observation; None of quantities
 
     def build(self, sim: Any) -> None:
@@ -270,6 +288,18 @@ class ManyWorldCalls:
     def is_terminated(self) -> Flags:
         """Return where episodes end, shape (n,)."""
         return read_rows(self.name, "is_terminated()", self.task.is_terminated(), (self._worlds,), bool)
+
+    def is_truncated(self) -> Flags:
+        """Return where episodes end although their state is as good as any, shape (n,)."""
+        return read_rows(self.name, "is_truncated()", self.task.is_truncated(), (self._worlds,), bool)
+
+    def next_level(self, world: int) -> float | None:
+        """Return the level of the episode after one that has ended, within [0, 1]; None: it follows success."""
+        levels = self.task.next_levels()
+        if levels is None:
+            return None
+        rows = read_rows(self.name, "next_levels()", levels, (self._worlds,), np.float64)
+        return round(min(max(float(rows[world]), 0.0), 1.0), 9)
 
     def is_success(self) -> Flags:
         """Return where the goal is reached, shape (n,)."""

@@ -10,10 +10,16 @@ from gymnasium import spaces
 
 from rlctl.errors import TaskError, check_name, short_repr
 
-Command = Literal["", "position", "step", "speed", "torque"]
+Command = Literal["", "position", "step", "correction", "speed", "torque"]
 WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 
-_KINDS: dict[Command, str] = {"position": "scale", "step": "step", "speed": "speed", "torque": "torque"}
+_KINDS: dict[Command, str] = {
+    "position": "scale",
+    "step": "step",
+    "correction": "correction",
+    "speed": "speed",
+    "torque": "torque",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,11 +41,13 @@ class Joints:
     max_speed: Sequence[float] = ()  # [rad/s or m/s]
     max_torque: Sequence[float] = ()
     action_step: Sequence[float] = ()  # only if the target is what `measured` has, plus `action_step * action`
+    action_correction: Sequence[float] = ()  # only if the target is what `reference` has, plus this times the action
     action_speed: Sequence[float] = ()  # only if the target is a speed, `action_speed * action` [rad/s or m/s]
     action_torque: Sequence[float] = ()  # only if the target is a torque or force, `action_torque * action`
     measured: str = ""  # observation, or quantity of a term, with the positions or last targets of these joints
     drive_gain: Sequence[float] = ()  # that stiffness in the drive's own unit: P of a servo, as it is written into it
     drive_voltage: Sequence[float] = ()  # [V], at which a servo of that gain has this stiffness
+    reference: str = ""  # observation that is a `Playback` without a quantity: the targets of action 0, of a clip
     clips_target: bool = False  # whether a position that an action commands is clipped to `low` and `high`
 
     def __post_init__(self) -> None:
@@ -67,6 +75,10 @@ class Joints:
             raise TaskError(
                 "joints: action_step needs measured: the observation with the joints' positions or last targets"
             )
+        if bool(self.action_correction) != bool(self.reference):
+            raise TaskError(
+                "joints: action_correction and reference, the observation that it corrects, need each other"
+            )
         if self.clips_target and not (self.low and self.high):
             raise TaskError("joints: clips_target needs low and high")
 
@@ -93,3 +105,5 @@ def check_joints(task: str, joints: Any, action_space: spaces.Space[Any], observ
         )
     if joints is not None and joints.measured:
         check_name(joints.measured, observed, f"{task}: joints: no observation", TaskError)
+    if joints is not None and joints.reference:
+        check_name(joints.reference, observed, f"{task}: joints: no observation", TaskError)

@@ -57,6 +57,11 @@ class TaskDefinition:
     then. The observation is a Dict space with one entry per name."""
     reward_weights: ClassVar[Mapping[str, float]] = {}
     """Weight per reward term; a term with weight 0 is a metric."""
+    deployed_parameters: ClassVar[Mapping[str, Any]] = {}
+    """Parameters of the task as a robot has it, such as `{"random_start": False}`: a controller's clock begins at 0.
+
+    Exports are verified with them, and `rlctl robot`, `play`, `diagnose` and `--policy reference` use them.
+    """
     mirror: ClassVar[Declaration] = {}
     """How the robot's mirror image, left and right exchanged, is observed and acts: per observation, and for `action`,
     which element is each element of the mirrored array, counted from 1, with its sign: `{"gyroscope": (-1, 2, -3)}`.

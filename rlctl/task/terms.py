@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,10 @@ class Term:
     """A function of measured quantities. `compute` uses operators and functions of NumPy that act on elements only,
     so that it also takes the symbols from which the export writes code."""
 
-    internal: ClassVar[Internal] = ""
+    @property
+    def internal(self) -> Internal:
+        """What a controller knows itself, which `compute` takes after the inputs."""
+        return ""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -41,7 +44,8 @@ class Term:
     def __call__(self, observed: Any) -> NDArray[np.float64]:
         """Return the observation for what `Task.observe` returned; raises `ValueError` where they do not fit."""
         given = observed if isinstance(observed, tuple) else (observed,)
-        if len(given) != (count := len(self.inputs) or 1):
+        count = len(self.inputs) + bool(self.internal)
+        if len(given) != count:
             raise ValueError(f"{len(given)} quantities, expected {count}")
         parts = self.compute(*[_as_vector(value) for value in given])
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
@@ -188,7 +192,11 @@ class LastAction(Term):
     """The action of the step before, within its bounds; zeros at the start. `observe` returns it."""
 
     kind: Literal["last_action"] = "last_action"
-    internal: ClassVar[Internal] = "last_action"
+
+    @property
+    def internal(self) -> Internal:
+        """The last action."""
+        return "last_action"
 
     def compute(self, *quantities: Any) -> list[Any]:
         """Return the action unchanged."""
@@ -206,7 +214,11 @@ class PhaseClock(Term):
     period_s: float
     offsets: Numbers = (0.0,)
     kind: Literal["phase_clock"] = "phase_clock"
-    internal: ClassVar[Internal] = "time"
+
+    @property
+    def internal(self) -> Internal:
+        """The time."""
+        return "time"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.period_s < math.inf:
@@ -224,6 +236,58 @@ class PhaseClock(Term):
             turns = turns + offset if offset else turns
             angles.append((turns - np.floor(turns)) * (2.0 * math.pi))
         return [*(np.sin(angle) for angle in angles), *(np.cos(angle) for angle in angles)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Playback(Term):
+    """A row of a table, one per `dt` [s], at the time of the episode: what a clip wants now. The last row stays.
+
+    With `quantity` the observation is that quantity minus the row. With `time`, the name of an input [s], a robot says
+    which row it is; otherwise the controller counts from the first row on. `observe` returns the quantity, if there is
+    one, and then the time, shape (1,) [s].
+    """
+
+    table: Sequence[Sequence[float]]
+    dt: float
+    quantity: str = ""
+    time: str = ""
+    kind: Literal["playback"] = "playback"
+
+    def __post_init__(self) -> None:
+        rows = np.asarray(self.table, np.float64)
+        if rows.ndim != 2 or not rows.size or not np.isfinite(rows).all():
+            raise TaskError(f"Playback: table has the shape {rows.shape}; it must be rows of finite numbers")
+        if not 0.0 < self.dt < math.inf:
+            raise TaskError(f"Playback: dt is {self.dt}; it must be a time above 0 [s]")
+        object.__setattr__(self, "table", tuple(map(tuple, np.round(rows, 6).tolist())))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The quantity and the time, as far as they are inputs."""
+        return tuple(name for name in (self.quantity, self.time) if name)
+
+    @property
+    def internal(self) -> Internal:
+        """The time, unless it is an input."""
+        return "" if self.time else "time"
+
+    @functools.cached_property
+    def rows(self) -> NDArray[np.float64]:
+        """The table as an array, shape (rows, size)."""
+        return np.array(self.table)
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the row of the time, or the quantity minus the row."""
+        *given, time = quantities
+        if time.shape[-1] != 1:
+            raise ValueError(f"a time of {time.shape[-1]} elements")
+        number = np.minimum(np.maximum(np.floor(time / self.dt + 0.5), 0.0), float(len(self.table) - 1))
+        row = self.rows[number[..., 0].astype(int)] if isinstance(number, np.ndarray) else number.look_up(self.rows)
+        if not given:
+            return [row]
+        if given[0].shape[-1] != len(self.table[0]):
+            raise ValueError(f"{given[0].shape[-1]} elements, and a row has {len(self.table[0])}")
+        return [given[0] - row]
 
 
 def find_quantity_sizes(terms: Mapping[str, Term], measured: Mapping[str, Any]) -> dict[str, int]:

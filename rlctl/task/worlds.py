@@ -363,6 +363,12 @@ class TaskWorlds:
             self._fail(wrong.row, str(wrong))
 
     def _find_truncated(self, terminated: Flags, worlds: Worlds) -> Flags:
+        late = self._find_late(terminated, worlds)
+        if not self.calls.has_end:
+            return late
+        return late | (self.calls.is_truncated()[worlds] & ~terminated)
+
+    def _find_late(self, terminated: Flags, worlds: Worlds) -> Flags:
         if self._steps_left > 0:  # no world can be at the time limit
             return self._no_flags if len(worlds) == self.count else self._no_flags[: len(worlds)]
         self._count_steps_left()
@@ -422,6 +428,10 @@ class TaskWorlds:
             success=bool(self._last_success[world]) if self.has_success else None,
             drawn=dict(self.drawn[world]),
         )
+
+    def next_level(self, world: int) -> float | None:
+        """Return the level of the episode after the one that has ended in a world; None: it follows success."""
+        return self.calls.next_level(world)
 
     def deepest_contact(self, world: int) -> float:
         """Return how far two bodies of a world overlap at most now [m]."""

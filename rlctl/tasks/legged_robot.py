@@ -82,7 +82,7 @@ def read_legged_robot(model: str, motors: AskedMotors | None = None) -> StarterR
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a fixed base or no legs.
     """
-    path, body = _load(model)
+    path, body = load_free(model, "--walk")
     if not body.joint_names:
         raise UsageError(f"--model {model}: it has no joints; --walk makes a task for a robot with legs")
     if body.fixed:
@@ -124,8 +124,8 @@ def _choose_lines(legged: _Legged) -> frozenset[str]:
     return frozenset(name for name, is_kept in chosen.items() if is_kept)
 
 
-def _load(model: str) -> tuple[Path, MujocoBody]:
-    """Load a model with a free base; raises `UsageError`."""
+def load_free(model: str, option: str) -> tuple[Path, MujocoBody]:
+    """Load a model with a free base and joints; raises `UsageError`, which names the option that needs one."""
     from rlctl.task.mujoco.sim import MujocoSim
 
     path = find_own_model(model)
@@ -135,7 +135,7 @@ def _load(model: str) -> tuple[Path, MujocoBody]:
         problem = str(error)
     with contextlib.suppress(TaskError):
         base = MujocoSim(control_dt=_CONTROL_DT, substeps=4).load("robot", path, fixed=True).base_name
-        problem = f"the base {base!r} of {path.name} cannot be free without mass; for an arm leave out --walk"
+        problem = f"the base {base!r} of {path.name} cannot be free without mass; for an arm leave out {option}"
     raise UsageError(f"--model: {problem}")
 
 

@@ -13,6 +13,7 @@ from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
 from rlctl.tasks.asked_motors import AskedMotors
+from rlctl.tasks.clip_options import ClipOptions
 from rlctl.tasks.source_text import fill_template, quote_code_of_markdown
 from rlctl.tasks.starter_robot import StarterRobot, make_planar_arm, read_robot
 
@@ -36,6 +37,8 @@ class NewPlugin:
     cls: str
     files: list[Path]  # relative to `folder`
     summary: str
+    follows: bool = False
+    """Whether it follows clips, so that `--policy reference` shows them."""
 
     @property
     def target(self) -> str:
@@ -59,10 +62,14 @@ class AskedRobot:
     tip: str | None = None
     """The link whose origin is between the fingers of a hand."""
     motors: AskedMotors | None = None
+    motions: tuple[str, ...] = ()
+    """Clips that it follows."""
+    clip: ClipOptions = ClipOptions()  # noqa: RUF009 (it cannot change)
+    """What a user says of the clips."""
 
     def check(self) -> None:
         """Raise `UsageError` for options that exclude each other, or need another one."""
-        kinds = [*(["walk"] if self.walk else []), *self.hand]
+        kinds = [*(["walk"] if self.walk else []), *self.hand, *(["motion"] if self.motions else [])]
         if len(kinds) > 1:
             raise UsageError(f"{' and '.join(f'--{kind}' for kind in kinds)} exclude each other: a task has one aim")
         chosen = {"link": self.link, "gripper": self.gripper, "tip": self.tip, "motors": self.motors}
@@ -71,6 +78,10 @@ class AskedRobot:
             raise UsageError(f"--{given[0]} needs --model")
         if kinds and self.link is not None:
             raise UsageError(f"--{kinds[0]} and --link exclude each other: --link is the tip of an arm that reaches")
+        if self.motions and self.motors is not None:
+            raise UsageError("--motors and --motion exclude each other: call set_motors in the task's build instead")
+        if not self.motions and self.clip != ClipOptions():
+            raise UsageError("--rate, --quaternion, --clip-joints and --frames need --motion")
         for name in ("gripper", "tip"):
             if chosen[name] is not None and not self.hand:
                 raise UsageError(f"--{name} needs --pick, --place or --push")
@@ -87,6 +98,8 @@ def create(
     tip: str | None = None,
     motors: str | None = None,
     backlash: str | None = None,
+    motions: Sequence[str] = (),
+    clip: ClipOptions = ClipOptions(),  # noqa: B008 (it cannot change)
 ) -> NewPlugin:
     """Write the plugin `name` atomically into the current folder, of an `AskedRobot`, whose attributes the others are.
 
@@ -95,7 +108,8 @@ def create(
     Raises `UsageError` for a name in use, for options that do not fit together, and for a model that is missing, or
     cannot do what is asked.
     """
-    asked = AskedRobot(model, link, walk, tuple(hand), gripper, tip, AskedMotors.read(motors, backlash))
+    real = AskedMotors.read(motors, backlash)
+    asked = AskedRobot(model, link, walk, tuple(hand), gripper, tip, real, tuple(motions), clip)
     asked.check()
     package = name.replace("-", "_").lower()
     _check(name, package)
@@ -118,7 +132,7 @@ def create(
         for path, data in content.items():
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)
             storage_files.write_new(temporary / path, data)
-    return NewPlugin(name, folder, package, cls, sorted(content), robot.summary)
+    return NewPlugin(name, folder, package, cls, sorted(content), robot.summary, follows=bool(asked.motions))
 
 
 def _read_robot(asked: AskedRobot) -> StarterRobot:
@@ -128,6 +142,10 @@ def _read_robot(asked: AskedRobot) -> StarterRobot:
         from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
 
         return read_legged_robot(asked.model, asked.motors)
+    if asked.motions:
+        from rlctl.tasks.motion_robot import read_motion_robot
+
+        return read_motion_robot(asked.model, asked.motions, asked.clip)
     if asked.hand:
         from rlctl.tasks.hand_robot import read_hand_robot
 
@@ -158,8 +176,9 @@ def show(plugin: NewPlugin, json: str | None) -> None:
         out.print(f"wrote {plugin.folder / file}")
     out.print(f"{plugin.summary}.")
     out.print("next:")
+    first = "reference" if plugin.follows else "zero"
     for command in (
-        f"rlctl replay {plugin.target} --policy zero",
+        f"rlctl replay {plugin.target} --policy {first}",
         f"rlctl check-env {plugin.target}",
         f'pip install -e "{plugin.folder}[test]"',
         f"rlctl train {plugin.name}",

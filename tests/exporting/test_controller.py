@@ -24,6 +24,7 @@ from rlctl.task.rotations import normalize
 from tests.exporting.controllers import build_controller, make_arm, make_policy, plan_of
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
+ROWS = [[0.5, -1.0], [0.25, 2.0], [-0.75, 1.0]]
 TERMS = {
     "gravity": terms.Gravity("orientation"),
     "angles": terms.Scaled("angles", offset=(0.1, -0.2), scale=(2.0,)),
@@ -34,8 +35,11 @@ TERMS = {
     "legs": terms.PhaseClock(0.35, offsets=(0.0, 0.5)),
     "euler": terms.Euler("orientation"),
     "clipped": terms.Scaled("angles", clip=(-0.2, 0.3)),
+    "clip": terms.Playback(ROWS, 0.2),
+    "off": terms.Playback(ROWS, 0.2, "angles"),
+    "timed": terms.Playback(ROWS, 0.25, "angles", "clip_time"),
 }
-QUANTITIES = {"orientation": 4, "angles": 2, "goal": 3, "hand": 3}
+QUANTITIES = {"orientation": 4, "angles": 2, "goal": 3, "hand": 3, "clip_time": 1}
 SIZES = {
     "gravity": 3,
     "angles": 2,
@@ -48,6 +52,9 @@ SIZES = {
     "euler": 3,
     "clipped": 2,
     "int": 1,
+    "clip": 2,
+    "off": 2,
+    "timed": 2,
 }
 JOINTS = Joints(["a", "b"], default_positions=[0.5, -0.5], low=[-0.4, -0.4], high=[0.4, 0.4])
 STEPS = 12
@@ -101,6 +108,10 @@ def play(policy, controllers, env):
                 "euler": TERMS["euler"](inputs["orientation"]),
                 "clipped": np.clip(inputs["angles"], -0.2, 0.3),
                 "int": inputs["int"],
+                # A row takes two steps; those of an odd number are in the middle, and 0.5 is rounded up.
+                "clip": ROWS[min((step + 1) // 2, 2)],
+                "off": inputs["angles"] - ROWS[min((step + 1) // 2, 2)],
+                "timed": inputs["angles"] - ROWS[int(np.clip(np.floor(inputs["clip_time"][0] / 0.25 + 0.5), 0, 2))],
             }
             stacked = history.add({name: np.asarray(part)[None] for name, part in parts.items()}, slice(None))
             last = policy.predict(np.concatenate([np.ravel(part) for part in stacked.values()]).astype(np.float32))
@@ -119,7 +130,14 @@ def test_terms_and_histories(history, start, tmp_path):
     policy = make_policy(env, seed=4)
     source, in_c = build_controller(policy, tmp_path)
     onnx = OnnxController(encode(build_graph(policy, plan_of(policy))))
-    assert [quantity.name for quantity in source.plan.quantities] == ["orientation", "angles", "hand", "goal", "int"]
+    assert [quantity.name for quantity in source.plan.quantities] == [
+        "orientation",
+        "angles",
+        "hand",
+        "goal",
+        "int",
+        "clip_time",
+    ]
     assert play(Policy(NumpyActor(policy)), [in_c, onnx], env) < 1e-5
     assert in_c.may_send
 
@@ -160,6 +178,8 @@ def commanding(**command):
         pytest.param({"action_scale": [0.5, 0.5]}, [0.5 + 0.5, -0.5 - 0.125], marks=pytest.mark.slow),
         ({"action_scale": [0.5, 0.5], "clips_target": True}, [0.4, -0.4]),
         ({"action_step": [0.1, 0.2], "measured": "angles"}, [0.25 + 0.1, -0.3 - 0.05]),
+        # The row of the clip at the first step, plus the scaled action.
+        ({"action_correction": [0.1, 0.2], "reference": "clip"}, [0.5 + 0.1, -1.0 - 0.05]),
         pytest.param({"action_speed": [2.0, 3.0]}, [2.0, -0.75], marks=pytest.mark.slow),
         pytest.param({"action_torque": [40.0, 20.0]}, [40.0, -5.0], marks=pytest.mark.slow),
     ],
@@ -180,6 +200,50 @@ def test_targets_by_hand(command, expected, tmp_path):
     assert source.target.find_targets({name: inputs[name] for name in source_names(source)}, action) == pytest.approx(
         expected, abs=1e-7
     )
+
+
+@needs_compiler
+def test_targets_follow_a_clip_and_stop_with_the_robot(tmp_path):
+    policy = commanding(action_correction=[0.1, 0.2], reference="clip")
+    source, in_c = build_controller(policy, tmp_path)
+    onnx = OnnxController(encode(build_graph(policy, plan_of(policy))))
+    rng = np.random.default_rng(0)
+    for step in range(8):
+        inputs = {name: draw_inputs(rng)[name] for name in source_names(source)}
+        for controller in (in_c, onnx):
+            action, target = controller.step(inputs)
+            row = ROWS[min((step + 1) // 2, 2)]
+            assert target == pytest.approx(row + np.array([0.1, 0.2]) * action, abs=1e-6)
+            assert target == pytest.approx(source.target.find_targets(inputs, action, step), abs=1e-6)
+            assert source.target.find_action(inputs, target, step) == pytest.approx(action, abs=1e-5)
+    in_c.begin()
+    _, first = in_c.step(inputs)
+    # The clip goes on, but a robot that is stopped, or measures nothing, does not.
+    for order in ("", "stop"):
+        if order:
+            in_c.order(order)
+        for _ in range(3):
+            _, target = in_c.step(inputs if order else None)
+            assert target.tolist() == first.tolist()
+    assert "clip (3 rows of a clip, at the time of the episode)" in source.write().header
+
+
+@needs_compiler
+def test_the_time_in_a_clip_may_be_an_input(tmp_path):
+    env = make_env(joints=dataclasses.replace(JOINTS, action_correction=0.1, reference="timed_joints"))
+    timed = {**env.observation_terms, "timed_joints": terms.Playback(ROWS, 0.25, time="clip_time")}
+    sizes = {**env.observation_sizes, "timed_joints": 2}
+    space = space_to_json(spaces.Box(-np.inf, np.inf, (sum(sizes.values()),), np.float32))
+    env = env.model_copy(update={"observation_terms": timed, "observation_sizes": sizes, "observation_space": space})
+    policy = make_policy(env)
+    source, in_c = build_controller(policy, tmp_path)
+    onnx = OnnxController(encode(build_graph(policy, plan_of(policy))))
+    for time, row in ((0.0, 0), (0.5, 2), (0.3, 1), (9.0, 2)):
+        inputs = {name: draw_inputs(np.random.default_rng(1))[name] for name in source_names(source)}
+        inputs["clip_time"] = np.array([time], np.float32)
+        for controller in (in_c, onnx):
+            action, target = controller.step(inputs)
+            assert target == pytest.approx(ROWS[row] + 0.1 * action, abs=1e-6)
 
 
 def source_names(source):
@@ -264,8 +328,8 @@ def test_the_header_and_the_metadata_name_everything(tmp_path):
         assert line in code.header
     model = build_graph(policy, plan_of(policy))
     metadata = {entry.key: entry.value for entry in model.metadata_props}
-    assert metadata["input_names"] == "orientation,angles,hand,goal,int"
-    assert metadata["input_sizes"] == "4,2,3,3,1"
+    assert metadata["input_names"] == "orientation,angles,hand,goal,int,clip_time"
+    assert metadata["input_sizes"] == "4,2,3,3,1,1"
     assert metadata["joint_names"] == "a,b"
     assert metadata["state"].startswith("state_action, state_steps: zeros when an episode begins")
     path = tmp_path / "controller.onnx"
@@ -293,6 +357,8 @@ def test_what_cannot_be_a_controller():
             ControllerPlan(env)
     with pytest.raises(UsageError, match="no input has the joints' positions: 'last' is computed inside"):
         write_code(commanding(action_step=[1.0, 1.0], measured="last"))
+    with pytest.raises(UsageError, match="reference: 'off' is no Playback without a quantity"):
+        write_code(commanding(action_correction=0.1, reference="off"))
     wrong = Limits.model_validate({"command": "position", "scale": 0.3})
     with pytest.raises(RecipeError, match="scale and offset differ from the task's"):
         write_code(commanding(action_scale=[0.5, 0.5]), wrong)

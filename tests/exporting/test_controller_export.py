@@ -116,3 +116,21 @@ def test_the_c_and_onnx_of_a_policy_name_its_histories(policy_of):
     assert "[0..5]     places [m], the last 3, oldest first" in write_c(policy, "cart").header
     metadata = {entry.key: entry.value for entry in build(policy).metadata_props}
     assert metadata["observation_history"] == "places:3"
+
+
+@pytest.mark.slow
+def test_a_controller_plays_its_clip_from_the_start(tmp_path):
+    spec = EnvSpec("rlctl_locomotion.follow:QuadrupedBow", {"episode_s": 1.0})
+    env = spec.make()
+    path = tmp_path / "bow.safetensors"
+    make_policy(describe(env), scale=0.02, spec=spec.__dict__).write(path)
+    env.close()
+    request = ExportRequest(str(path), ("onnx", "c"), controller=True, output=tmp_path / "bow.c")
+    for report in export_controller(request):
+        assert report.agreement.max_difference < 1e-5
+        assert report.max_target_difference < 1e-5
+        assert report.closed_loop.agrees
+        # Neither the clip nor its time is an input.
+        sizes = {"orientation": 4, "joint_positions": 12, "gyroscope": 3, "joint_velocities": 12}
+        assert report.details["input_sizes"] == sizes
+        assert report.details["target"] == "joint position [rad] = joints + target_factor * action"

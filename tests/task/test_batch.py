@@ -320,3 +320,36 @@ def test_an_event_function_that_fails_names_its_world(make_both):
         batch.step(np.zeros((3, 2), np.float32))
     assert caught.value.world == 1
     assert env.observation_sizes["height"] == 1
+
+
+class Ending(Stool):
+    """Its episodes end in the fourth step where the goal is high, and as failures choose the level of the next."""
+
+    def is_truncated(self):
+        return (self.steps == 4) & (self.goal > 0.25)
+
+    def next_levels(self):
+        return np.where(self.goal > 0.25, 1.5, self.goal)
+
+
+def test_a_task_truncates_its_episodes_before_the_time_limit():
+    worlds = np.arange(len(SEEDS))
+    with contextlib.closing(TaskWorlds(Ending(), len(SEEDS))) as batch:
+        batch.reset(worlds, list(SEEDS))
+        high = batch.task.goal > 0.25
+        assert 0 < high.sum() < len(high)
+        for step in range(1, 5):
+            result = batch.step(np.zeros((len(SEEDS), 2)))
+            assert not result.terminated.any()
+            assert np.array_equal(result.truncated, high & (step == 4))
+        # Levels are within [0, 1].
+        levels = [batch.next_level(world) for world in worlds]
+        assert levels == [
+            1.0 if is_high else round(goal, 9) for is_high, goal in zip(high, batch.task.goal, strict=True)
+        ]
+        # Some of the worlds alone.
+        chosen = worlds[high][:2]
+        batch.reset(chosen, [SEEDS[world] for world in chosen])
+        truncated = [batch.step(np.zeros((2, 2)), chosen).truncated for _ in range(4)]
+        assert np.array_equal(truncated, [[False] * 2] * 3 + [[True] * 2])
+    assert Stool().next_levels() is None

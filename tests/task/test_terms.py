@@ -213,3 +213,34 @@ def test_the_measured_joints_are_observed():
 
     with pytest.raises(TaskError, match=r"joints: no observation 'plase'\. Did you mean 'place'"):
         TaskEnv(Moving())
+
+
+def test_a_clip_is_played_back_by_hand():
+    rows = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
+    clip = terms.Playback(rows, 0.1)
+    assert (clip.inputs, clip.internal) == ((), "time")
+    # 0.14 s is nearest to row 1; before the first row and after the last one it stays.
+    assert clip(0.14).tolist() == [3.0, 4.0]
+    assert clip(np.array([[-1.0], [0.26], [9.0]])).tolist() == [[1.0, 2.0], [5.0, 6.0], [5.0, 6.0]]
+    error = terms.Playback(rows, 0.1, "angles", "clip_time")
+    assert (error.inputs, error.internal) == (("angles", "clip_time"), "")
+    assert error((np.array([1.0, 1.0]), np.array([0.1]))).tolist() == [-2.0, -3.0]
+
+
+@pytest.mark.parametrize(
+    ("table", "dt", "problem"),
+    [
+        ([], 0.1, "rows of finite numbers"),
+        ([[1.0, np.nan]], 0.1, "rows of finite numbers"),
+        ([1.0, 2.0], 0.1, "rows of finite numbers"),
+        ([[1.0]], 0.0, "above 0"),
+    ],
+)
+def test_tables_that_cannot_be_played_back(table, dt, problem):
+    with pytest.raises(TaskError, match=problem):
+        terms.Playback(table, dt)
+
+
+def test_a_quantity_of_another_size_than_the_rows():
+    with pytest.raises(ValueError, match="1 elements, and a row has 2"):
+        terms.Playback([[1.0, 2.0]], 0.1, "angles")((np.array([1.0]), np.array([0.0])))

@@ -62,6 +62,10 @@ CASES = {
         ),
     ),
     "ppo, levels, on worlds in batches": (STOOL, settings("ppo", **LEVELS)),
+    "ppo, levels that the task chooses": (
+        "rlctl_locomotion.follow:QuadrupedBow",
+        settings("ppo", task={"episode_s": 0.4, "tolerance": 0.0}, stages=[{"level": {"start": 1.0}}]),
+    ),
     "sac, levels": (STOOL, settings("sac", **LEVELS)),
     "ppo, privileged, on reach": (
         "reach",

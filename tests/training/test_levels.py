@@ -55,6 +55,14 @@ def test_what_is_mastered_gets_harder(train, task):
     assert first.observations[0, 0] == 1.0  # what the task observes is its level
 
 
+def test_a_task_chooses_the_levels_of_its_episodes(train):
+    run = train("tests.training.levelled:ChoosingBatch", following(start=0.5), envs="").run
+    with run.metrics_file.open() as file:
+        rows = list(csv.DictReader(file))
+    # After 16 steps three episodes have ended, after 32 steps six: 0.5, 0.25, 0.125, 0.0625, .. (rounded to 4 places)
+    assert [float(row["level"]) for row in rows] == [0.0625, 0.0078]
+
+
 def test_the_table_has_levels_if_a_later_stage_has(train):
     always = {"level": 0.2, "promote": {"return": -1000.0, "window": 1}}
     settings = {**SMALL, "stages": [always, {"level": {"start": 0.4, "up": 0.1}}]}

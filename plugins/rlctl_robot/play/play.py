@@ -70,8 +70,9 @@ def run_play(request: PlayRequest, on_start: Callable[[str], None]) -> PlayResul
     )
     controls = Controls(record=request.record)
     server = PageServer(request.port, controls)
-    with closing(make_drawable(source.spec)) as env, _stop_on_signals(controls):
-        game = Game(env, source.spec, source, controls, server)
+    spec = source.spec.as_deployed()
+    with closing(make_drawable(spec)) as env, _stop_on_signals(controls):
+        game = Game(env, spec, source, controls, server)
         on_start(server.start())
         try:
             return game.play(request.seed)

@@ -58,7 +58,7 @@ class CommandComparison:
         if (frames := self._frames.maxlen or 1) > 1:
             self._frames.extend([observation] * (1 if self._frames else frames))
             observation = np.concatenate(self._frames, axis=-1)
-        command = self._interface.find_command(self._policy.predict(observation), sent.parts)
+        command = self._interface.find_command(self._policy.predict(observation), sent.parts, sent.step)
         self._commands[sent.sequence] = command, sent.episode, sent.step
 
     def compare(self, sequence: int, command: NDArray[Any]) -> None:

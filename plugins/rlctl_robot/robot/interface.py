@@ -51,7 +51,7 @@ class Interface(abc.ABC):
         """Return a command; raises `ValueError` with the reason for what is none."""
 
     @abc.abstractmethod
-    def find_action(self, command: Array | None, measured: Parts) -> Array:
+    def find_action(self, command: Array | None, measured: Parts, step: int) -> Array:
         """Return the environment's action for the newest command; None: none has come in this episode."""
 
     @abc.abstractmethod
@@ -63,7 +63,7 @@ class Interface(abc.ABC):
         """Return the policy's observation for what was sent in a step."""
 
     @abc.abstractmethod
-    def find_command(self, action: Array, sent: Parts) -> Array:
+    def find_command(self, action: Array, sent: Parts, step: int) -> Array:
         """Return the command of a policy's action for what was sent."""
 
 
@@ -78,7 +78,7 @@ class PolicyInterface(Interface):
         """Return an action within its bounds."""
         return read_action(values, self._space)
 
-    def find_action(self, command: Array | None, measured: Parts) -> Array:
+    def find_action(self, command: Array | None, measured: Parts, step: int) -> Array:
         """Return the action itself."""
         return self._zero if command is None else command
 
@@ -89,7 +89,7 @@ class PolicyInterface(Interface):
         """Return what was sent, in the policy's form."""
         return self._reader.read(sent)
 
-    def find_command(self, action: Array, sent: Parts) -> Array:
+    def find_command(self, action: Array, sent: Parts, step: int) -> Array:
         """Return the action itself."""
         return action
 
@@ -123,11 +123,11 @@ class ControllerInterface(Interface):
             return read_action(values, self._space)
         return _read_vector(values, len(self._target.factor), "a target")
 
-    def find_action(self, command: Array | None, measured: Parts) -> Array:
+    def find_action(self, command: Array | None, measured: Parts, step: int) -> Array:
         """Return the action that sends the joints from where they are now to the targets."""
         if command is None or self._target is None:
             return self._zero if command is None else command
-        action = self._target.find_action(measured, command)
+        action = self._target.find_action(measured, command, step)
         return np.clip(action, self._space.low, self._space.high).astype(self._space.dtype)
 
     def begin(self) -> None:
@@ -140,10 +140,10 @@ class ControllerInterface(Interface):
         parts = self._observation.observe(sent, step, self._last_action)
         return self._reader.read({name: parts[name] for name in self._reader.shapes})
 
-    def find_command(self, action: Array, sent: Parts) -> Array:
+    def find_command(self, action: Array, sent: Parts, step: int) -> Array:
         """Return the joints' targets for an action."""
         self._last_action = np.ravel(action)
-        return action if self._target is None else self._target.find_targets(sent, action)
+        return action if self._target is None else self._target.find_targets(sent, action, step)
 
 
 def read_action(values: Any, space: spaces.Space[Any]) -> Array:

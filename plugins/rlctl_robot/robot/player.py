@@ -94,7 +94,7 @@ class RobotPlayer:
             command = await self._exchange(measured, step)
             self._counts.held += command is None
             newest = newest if command is None else command
-            action = self._interface.find_action(newest, measured)
+            action = self._interface.find_action(newest, measured, step)
             # `chosen` is bound now: the next step has another action.
             result = self._call(lambda chosen=action: self._worlds.step([chosen]))  # type: ignore[misc]
             observations = result.observation

@@ -143,9 +143,10 @@ def _find_policy(request: RobotRequest, pretrained: bool) -> tuple[Path | None, 
 def _choose_spec(task: str, policy: Policy | None, changes: EnvChanges) -> EnvSpec:
     """Return the environment of the policy's training, or of the task's recipe; a robot measures no stacked frames."""
     if policy is None:
-        return changes.apply(resolve_task(task))
+        return changes.apply(resolve_task(task).as_deployed())
     other = None if lookup.is_policy_file(task) else task
-    return dataclasses.replace(policy.info.derive_spec(other, changes).resolve(), frame_stack=1)
+    spec = policy.info.derive_spec(other, changes).as_deployed()
+    return dataclasses.replace(spec.resolve(), frame_stack=1)
 
 
 def name_actions(info: EnvInfo, env: Any) -> list[str]:

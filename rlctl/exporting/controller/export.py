@@ -105,7 +105,7 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
 
 def _choose_spec(spec: EnvSpec, sim: Engine | None) -> EnvSpec:
     """Return the environment of the verification: without events, because noise acts on computed terms."""
-    return dataclasses.replace(spec.with_engine(sim), randomize=False, events={})
+    return dataclasses.replace(spec.as_deployed().with_engine(sim), randomize=False, events={})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

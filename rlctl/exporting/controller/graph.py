@@ -13,6 +13,7 @@ from rlctl.policy import onnx_policy
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_graph import BATCH, Graph
 from rlctl.task.layout import Part
+from rlctl.task.terms import Playback
 
 TARGET = "target"
 OBSERVATION, LAST_ACTION, STEPS = "state_observation", "state_action", "state_steps"
@@ -105,13 +106,17 @@ class _Writer:
         sizes = {quantity.name: quantity.size for quantity in self._plan.quantities}
         symbols = [GraphSymbol(graph, self._read(self._inputs[name]), sizes[name]) for name in term.inputs]
         if term.internal == "last_action":
-            symbols = [GraphSymbol(graph, self._read(self._last_action), part.size)]
+            symbols.append(GraphSymbol(graph, self._read(self._last_action), part.size))
         elif term.internal == "time":
-            dt = graph.constant("controller/control_dt", np.float64(self._plan.env.control_dt))
-            symbols = [GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)]
+            symbols.append(self._read_time())
         parts: list[GraphSymbol] = term.compute(*symbols)
         joined = graph.concatenate([symbol.value for symbol in parts])
         return graph.cast(joined, self._plan.dtype)
+
+    def _read_time(self) -> GraphSymbol:
+        graph = self._graph
+        dt = graph.constant(f"controller/control_dt_{graph.count_constants()}", np.float64(self._plan.env.control_dt))
+        return GraphSymbol(graph, graph.add("Mul", self._read(self._steps), dt), 1)
 
     def _read(self, value: str) -> str:
         return self._graph.cast(value, np.float64)
@@ -164,12 +169,23 @@ class _Writer:
             value = graph.add("Add", graph.constant("target/default", target.default), value)
         elif target.kind == "step" and joints is not None:
             value = graph.add("Add", self._read(self._inputs[joints.measured]), value)
+        elif target.playback is not None:
+            value = graph.add("Add", self._add_reference(target.playback), value)
         if target.clips:
             value = graph.add("Max", value, graph.constant("target/low", target.low))
             value = graph.add("Min", value, graph.constant("target/high", target.high))
         if (one := self._mapping.targets) is not None:
             value = self._map("mapping/target", value, one)
         graph.output(value, TARGET, np.float64, (BATCH, self._plan.action_size), self._describe_target(target))
+
+    def _add_reference(self, playback: Playback) -> str:
+        """Add the row of a clip that a target corrects."""
+        if playback.time:
+            time = GraphSymbol(self._graph, self._read(self._inputs[playback.time]), 1)
+        else:
+            time = self._read_time()
+        (row,) = playback.compute(time)
+        return str(row.value)
 
     def _describe_target(self, target: JointTarget) -> str:
         one = self._mapping.targets

@@ -31,9 +31,10 @@ class ControllerObservation:
                 newest[part.name] = inputs[part.name]
             elif part.term.internal == "last_action":
                 newest[part.name] = last_action
-            elif part.term.internal == "time":
-                newest[part.name] = part.term(np.array([step * (self._plan.env.control_dt or 0.0)]))
             else:
-                newest[part.name] = part.term(tuple(inputs[name] for name in part.term.inputs))
+                given = [inputs[name] for name in part.term.inputs]
+                if part.term.internal == "time":
+                    given.append(np.array([step * (self._plan.env.control_dt or 0.0)]))
+                newest[part.name] = part.term(tuple(given))
         rows = {name: np.asarray(value)[None] for name, value in newest.items()}
         return {name: value[0] for name, value in self._history.add(rows, slice(None)).items()}

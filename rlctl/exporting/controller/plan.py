@@ -17,9 +17,15 @@ from rlctl.limits.fitting import FittedLimits
 from rlctl.policy.c_policy import observation_type
 from rlctl.task.joints import Command
 from rlctl.task.layout import Layout, Part
-from rlctl.task.terms import Gravity, Internal, Scaled
+from rlctl.task.terms import Gravity, Internal, Playback, Scaled
 
-_UNITS = {"position": "rad or m", "step": "rad or m", "speed": "rad/s or m/s", "torque": "N m or N"}
+_UNITS = {
+    "position": "rad or m",
+    "step": "rad or m",
+    "correction": "rad or m",
+    "speed": "rad/s or m/s",
+    "torque": "N m or N",
+}
 Clips = Literal["", "exact", "towards"]
 _KEYWORDS = set(
     re.findall(
@@ -66,6 +72,8 @@ class JointTarget:
     high: NDArray[np.float64]
     tracks: bool = False  # whether limits bound the targets themselves, from one to the next
     joint_unit: str = ""  # of the measured positions of all joints: `rad`, `m`, or another word where it is unknown
+    playback: Playback | None = None  # the clip whose rows are corrected
+    control_dt: float = 0.0  # [s]
 
     @property
     def unit(self) -> str:
@@ -79,9 +87,11 @@ class JointTarget:
         """What it commands, as ros2_control calls it."""
         return {"speed": "velocity", "torque": "effort"}.get(self.kind, "position")
 
-    def find_targets(self, inputs: Mapping[str, NDArray[Any]], action: NDArray[Any]) -> NDArray[np.float64]:
-        """Return the joints' targets for an action and the quantities that were measured before it."""
-        base = self._find_base(inputs)
+    def find_targets(
+        self, inputs: Mapping[str, NDArray[Any]], action: NDArray[Any], step: int = 0
+    ) -> NDArray[np.float64]:
+        """Return the joints' targets for an action in a step of the episode, and what was measured before it."""
+        base = self._find_base(inputs, step)
         targets = np.asarray(base + self.factor * action.ravel(), np.float64)
         if not self.clips:
             return targets
@@ -90,11 +100,16 @@ class JointTarget:
             low, high = np.minimum(low, base), np.maximum(high, base)
         return np.clip(targets, low, high)
 
-    def find_action(self, inputs: Mapping[str, NDArray[Any]], targets: NDArray[Any]) -> NDArray[np.float64]:
+    def find_action(
+        self, inputs: Mapping[str, NDArray[Any]], targets: NDArray[Any], step: int = 0
+    ) -> NDArray[np.float64]:
         """Return the action with which joints that are where `inputs` has them go to targets; it has no bounds."""
-        return np.asarray((targets.ravel() - self._find_base(inputs)) / self.factor, np.float64)
+        return np.asarray((targets.ravel() - self._find_base(inputs, step)) / self.factor, np.float64)
 
-    def _find_base(self, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+    def _find_base(self, inputs: Mapping[str, NDArray[Any]], step: int) -> NDArray[Any]:
+        if self.playback is not None:
+            time = inputs[self.playback.time] if self.playback.time else np.array([step * self.control_dt])
+            return self.playback(time)
         if self.kind != "step":
             return self.default
         values = np.concatenate([np.ravel(value) for value in inputs.values()])
@@ -103,10 +118,11 @@ class JointTarget:
     @property
     def formula(self) -> str:
         """How it follows from the action, for people."""
-        base = {"position": "default_positions + ", "step": f"{self.input} + "}.get(self.kind, "")
+        bases = {"position": "default_positions + ", "step": f"{self.input} + ", "correction": f"{self.input} + "}
+        base = bases.get(self.kind, "")
         clipped = "" if not self.clips else ", within target_low and target_high"
         clipped = ", which the limits bound from one target to the next" if self.tracks else clipped
-        kind = "position" if self.kind == "step" else self.kind
+        kind = "position" if self.kind in ("step", "correction") else self.kind
         return f"joint {kind} [{self.unit}] = {base}target_factor * action{clipped}"
 
 
@@ -153,8 +169,7 @@ class ControllerPlan:
         for part in self.observed:
             measured = {part.name: part.size}
             if part.term is not None:
-                names = () if part.term.internal else part.term.inputs
-                measured = {name: env.quantity_sizes[name] for name in names}
+                measured = {name: env.quantity_sizes[name] for name in part.term.inputs}
             for name, size in measured.items():
                 if sizes.setdefault(name, size) != size:
                     raise UsageError(f"--controller: two quantities are named {name!r}, of different sizes")
@@ -239,14 +254,34 @@ class ControllerPlan:
                 raise RecipeError(f"limits: scale and offset differ from the task's {factor.tolist()}; leave them out")
         source = self.find_quantity(joints.measured) if kind == "step" else None
         measured, name = (0, "") if source is None else (source.start, source.identifier)
+        playback = None
+        if kind == "correction":
+            playback, name = self._find_playback(joints.reference), joints.reference
         clips: Clips = ""
         if joints.clips_target:
             clips = "towards" if fitted is not None and kind == "step" else "exact"
         low, high = (np.array(ends or [0.0] * count) for ends in (joints.low, joints.high))
         unit = self.env.observation_units.get(joints.measured, "")
         return JointTarget(
-            kind, factor, default, measured, name, clips, low, high, tracks=steps is not None, joint_unit=unit
+            kind,
+            factor,
+            default,
+            measured,
+            name,
+            clips,
+            low,
+            high,
+            tracks=steps is not None,
+            joint_unit=unit,
+            playback=playback,
+            control_dt=self.env.control_dt or 0.0,
         )
+
+    def _find_playback(self, name: str) -> Playback:
+        term = self.env.observation_terms.get(name)
+        if not isinstance(term, Playback) or term.quantity:
+            raise UsageError(f"--controller: reference: {name!r} is no Playback without a quantity")
+        return term
 
     def describe_internal(self) -> list[str]:
         """Return what the controller computes from the inputs, for people."""
@@ -257,6 +292,9 @@ class ControllerPlan:
 
 
 def _describe_term(term: AnyTerm) -> str:
+    if isinstance(term, Playback):
+        rows = f"{len(term.table)} rows of a clip, at {term.time or 'the time of the episode'}"
+        return f"{term.quantity} - {rows}" if term.quantity else rows
     if not isinstance(term, Scaled):
         return " ".join([term.kind.replace("_", " "), *(["of"] if term.inputs else []), ", ".join(term.inputs)]).strip()
     offset, scale = (", ".join(f"{number:.6g}" for number in numbers) for numbers in (term.offset, term.scale))

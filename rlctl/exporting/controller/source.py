@@ -12,17 +12,19 @@ from rlctl.exporting.c_source import CFunction, CSource
 from rlctl.exporting.controller.limits_source import LimitsSource
 from rlctl.exporting.controller.plan import ControllerPlan, JointTarget, Observed, Quantity
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ElementMap, ProgramMapping
-from rlctl.exporting.controller.symbols import CSymbol
+from rlctl.exporting.controller.symbols import CSymbol, CTables
 from rlctl.limits.fitting import fit_limits
 from rlctl.limits.limits import NO_LIMITS, Limits
-from rlctl.policy.c_writer import CWriter, write_number
+from rlctl.policy.c_writer import CWriter, write_array, write_number
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.network import Network
+from rlctl.task.terms import Playback
 from rlctl.version import __version__
 
 _BASES = {
     "position": "{name}_default_positions[i] + ",
     "step": "position + ",
+    "correction": "reference[i] + ",
 }
 
 
@@ -38,6 +40,8 @@ class _TargetCode:
     clips: str
     measured: int
     default: bool
+    reference: list[str]  # expressions of the row that is corrected
+    needs_inputs: bool
 
 
 class ControllerSource:
@@ -63,6 +67,7 @@ class ControllerSource:
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
         self.target = plan.find_target(None if limits is None else fitted)
         self.name = c_source.make_identifier(file_name)
+        self._tables = CTables()
         self._values = self._describe(policy)
 
     def write(self, timing: str = "") -> CSource:
@@ -103,7 +108,7 @@ class ControllerSource:
             "program_target": self._mapping.targets,
             "target_lines": [] if (one := self._mapping.targets) is None else self._write_targets(one),
             "term_lines": [line for part in plan.observed for line in self._write_term(part, described.type)],
-            "constants": writer.constants,
+            "constants": [*writer.constants, *self._write_tables()],
             "functions": list_functions(writer),
             "statements": writer.statements,
         }
@@ -153,19 +158,39 @@ class ControllerSource:
             return [loop, f"    newest[{part.newest} + i] = ({kind})values[{start} + i];", "}"]
         symbols = [self._read_quantity(quantities[name].start, quantities[name].size) for name in part.term.inputs]
         if part.term.internal == "last_action":
-            symbols = [CSymbol([f"(double)state->last_action[{index}]" for index in range(part.size)])]
+            symbols.append(CSymbol([f"(double)state->last_action[{index}]" for index in range(part.size)]))
         elif part.term.internal == "time":
-            symbols = [CSymbol([f"((double)state->steps * {self.plan.env.control_dt!r})"])]
+            symbols.append(self._read_time())
         parts: list[CSymbol] = part.term.compute(*symbols)
         expressions = [element for symbol in parts for element in symbol.elements]
         return [f"newest[{part.newest + i}] = ({kind}){text};" for i, text in enumerate(expressions)]
 
     def _read_quantity(self, start: int, size: int) -> CSymbol:
-        return CSymbol([f"values[{start + index}]" for index in range(size)])
+        return CSymbol([f"values[{start + index}]" for index in range(size)], self._tables)
+
+    def _read_time(self) -> CSymbol:
+        return CSymbol([f"((double)state->steps * {self.plan.env.control_dt!r})"], self._tables)
+
+    def _write_tables(self) -> list[str]:
+        arrays = self._tables.arrays.values()
+        return [
+            write_array(f"static const double {name}", [write_number(value, "double") for value in table.ravel()])
+            for name, table in arrays
+        ]
+
+    def _write_reference(self, playback: Playback) -> list[str]:
+        """Return an expression per joint for the row of a clip that a target corrects."""
+        time = self._read_time()
+        if playback.time:
+            quantity = self.plan.find_quantity(playback.time)
+            time = self._read_quantity(quantity.start, quantity.size)
+        (row,) = playback.compute(time)
+        return [*row.elements]
 
     def _describe_target(self, target: JointTarget) -> _TargetCode:
         base = _BASES.get(target.kind, "").format(name=self.name)
-        is_position = target.kind == "position"
+        is_position, joints = target.kind == "position", self.plan.env.joints
+        playback = target.playback
         return _TargetCode(
             target.kind,
             target.interface,
@@ -174,7 +199,9 @@ class ControllerSource:
             base,
             target.clips,
             target.measured,
-            default=is_position,
+            default=is_position or (playback is not None and bool(joints and joints.default_positions)),
+            reference=[] if playback is None else self._write_reference(playback),
+            needs_inputs=target.kind == "step" or (playback is not None and bool(playback.time)),
         )
 
     def _list_arrays(self, described: CFunction) -> list[tuple[str, str, str, list[str]]]:

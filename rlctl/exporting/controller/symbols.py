@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.policy.onnx_graph import Graph
 
@@ -59,12 +60,17 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin, abc.ABC):
     def take(self, elements: range) -> Self:
         """Return some elements."""
 
+    @abc.abstractmethod
+    def look_up(self, table: NDArray[np.float64]) -> Self:
+        """Return the row of a table, shape (rows, size), whose number this is: a whole number within it."""
+
 
 class CSymbol(Symbol):
     """Expressions in C, of type double."""
 
-    def __init__(self, elements: Sequence[str]) -> None:
+    def __init__(self, elements: Sequence[str], tables: "CTables | None" = None) -> None:
         self.elements, self.size = elements, len(elements)
+        self._tables = tables
 
     def apply(self, function: str, operands: Sequence[Any]) -> "CSymbol":
         """Return an expression per element."""
@@ -74,11 +80,33 @@ class CSymbol(Symbol):
         ]
         size = max(map(len, columns))
         form = _C[function]
-        return CSymbol([form.format(*(column[i % len(column)] for column in columns)) for i in range(size)])
+        tables = next((operand._tables for operand in operands if isinstance(operand, CSymbol)), None)
+        return CSymbol([form.format(*(column[i % len(column)] for column in columns)) for i in range(size)], tables)
 
     def take(self, elements: range) -> "CSymbol":
         """Return some expressions."""
-        return CSymbol([self.elements[index] for index in elements])
+        return CSymbol([self.elements[index] for index in elements], self._tables)
+
+    def look_up(self, table: NDArray[np.float64]) -> "CSymbol":
+        """Return expressions that read a constant array."""
+        assert self._tables is not None
+        name, size = self._tables.add(table), table.shape[1]
+        row = f"{name} + {size} * (int){self.elements[0]}"
+        return CSymbol([f"({row})[{index}]" for index in range(size)], self._tables)
+
+
+class CTables:
+    """The constant arrays that expressions in C read; equal tables are one array."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[bytes, tuple[str, NDArray[np.float64]]] = {}
+
+    def add(self, table: NDArray[np.float64]) -> str:
+        """Return the name of the array of a table."""
+        key = table.tobytes()
+        if key not in self.arrays:
+            self.arrays[key] = f"table_{len(self.arrays) + 1}", table
+        return self.arrays[key][0]
 
 
 class GraphSymbol(Symbol):
@@ -109,3 +137,11 @@ class GraphSymbol(Symbol):
         """Add a node that selects elements."""
         indices = self.graph.constant(f"term/{self.graph.count_constants()}", np.array(elements, np.int64))
         return GraphSymbol(self.graph, self.graph.add("Gather", self.value, indices, axis=1), len(elements))
+
+    def look_up(self, table: NDArray[np.float64]) -> "GraphSymbol":
+        """Add nodes that select a row."""
+        graph = self.graph
+        first = graph.constant(f"term/{graph.count_constants()}", np.array(0, np.int64))
+        rows = graph.add("Gather", graph.cast(self.value, np.int64), first, axis=1)  # shape (batch,)
+        values = graph.constant(f"term/{graph.count_constants()}", table)
+        return GraphSymbol(graph, graph.add("Gather", values, rows, axis=0), table.shape[1])

@@ -158,12 +158,12 @@ def verify_controller(
             show(number)
             controller.begin()
             steps = zip(episode.inputs, episode.requested, episode.actions, episode.targets, strict=True)
-            for inputs, requested, expected, bounded in steps:
+            for step, (inputs, requested, expected, bounded) in enumerate(steps):
                 own, action, targets = controller.follow(inputs, requested)
                 _compare(agreement, requested, own)
                 _compare(agreement, expected, action)
                 if target is not None and targets is not None:
-                    wanted = target.find_targets(inputs, expected) if bounded is None else bounded
+                    wanted = target.find_targets(inputs, expected, step) if bounded is None else bounded
                     worst = max(worst, _compare(agreement, wanted, targets))
     agreement.observations = sum(len(episode.actions) for episode in recorded)
 
