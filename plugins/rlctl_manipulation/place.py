@@ -1,0 +1,112 @@
+"""Place: the arm of pick.py carries a block to a goal on the table and lets go of it, in many worlds at once."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from rlctl.task import CommandTerm, WorldRngs, rewards
+from rlctl.task.rotations import from_axis
+from rlctl_manipulation.pick import BLOCK, GRASP, LIFTED, RIGHT, Pick
+
+NEAREST = 0.1  # [m], from the block's start to the goal
+FREE = 0.005  # [m], between each finger and a block that is released
+RESTING = 0.05  # [m/s], speed of a block at rest
+LOW = 0.01  # [m], above the table: a block that falls from there stays where it is
+CARRY_HEIGHT = 0.1  # [m], above the table, of a block in the hand at the far end of its way
+
+# The arm seen from its side, with joints 3 and 5 at 0. [m]
+SHOULDER = 0.333  # height
+UPPER, FOREARM = np.array([0.0825, 0.316]), np.array([-0.0825, 0.384])  # forwards and up, where joints 2 and 4 are at 0
+WRIST_AHEAD, WRIST_ABOVE = -0.088, 0.207  # of the wrist, from the grasp frame of a hand that points down
+
+
+@dataclass
+class Place(Pick):
+    """Set the block down at the goal on the table and let go of it."""
+
+    carried: np.ndarray = field(init=False, repr=False)  # 1 where the block has been lifted
+
+    goal_low: ClassVar[np.ndarray] = np.array([0.4, -0.2, BLOCK[2]])  # [m], of the area that goals are drawn from
+    goal_high: ClassVar[np.ndarray] = np.array([0.65, 0.2, BLOCK[2]])  # [m]
+    reward_weights = {**Pick.reward_weights, "lower": 0.3, "release": 0.3}
+    per_world = {**Pick.per_world, "carried": ()}
+
+    def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
+        """Start as `Pick` does; a goal that is near the block moves by half of the area, around its edges.
+
+        At level 0.6 four in ten episodes begin with the block in the hand, on the way to the goal.
+        """
+        super().reset(rng, worlds)
+        goal, size = self.goal[worlds], self.goal_high - self.goal_low
+        moved = self.goal_low + np.fmod(goal - self.goal_low + size / 2, np.maximum(size, 1e-9))
+        near = rewards.distance(goal, self.block.base_position[worlds]) < NEAREST
+        self.goal[worlds] = np.where(near[:, None], moved, goal)
+        luck, share, turn = rng.uniform((0.0, 0.0, -0.7), (1.0, 1.0, 0.7)).T
+        held = luck >= self.level[worlds]
+        if held.any():
+            self.put_in_hand(worlds[held], share[held] ** 2, turn[held])
+
+    def put_in_hand(self, worlds: np.ndarray, share: np.ndarray, turn: np.ndarray) -> None:
+        """Close the hand about the block at a `share` of the straight way from the goal back to above its start.
+
+        The hand points down, turned by `turn` [rad].
+        """
+        start = self.block.base_position[worlds] + (0.0, 0.0, CARRY_HEIGHT)
+        point = self.goal[worlds] + share[:, None] * (start - self.goal[worlds])
+        finger = np.full(len(worlds), BLOCK[1])
+        joints = point_down(point, turn)
+        self.arm.set_joints(np.column_stack([joints, finger, finger]), worlds=worlds)
+        closing = self.look(0.0, 1.0, 0.0)[worlds]
+        yaw = np.arctan2(-closing[:, 0], closing[:, 1])
+        self.block.set_base(self.arm.link_position(GRASP)[worlds], from_axis((0, 0, 1), yaw), worlds=worlds)
+        self.target[worlds] = np.column_stack([joints, np.zeros(len(worlds))])
+        self.carried[worlds] = 1.0
+
+    def measure(self) -> None:
+        """Compute what rewards and success share, once per step."""
+        super().measure()
+        x, y, height = (self.block_position - self.goal).T
+        self.carried = np.where(self.grasped & (height > LIFTED), 1.0, self.carried)
+        self.distance, self.height = np.hypot(x, y), np.maximum(height, 0.0)  # [m], along the table and above it
+        self.above = self.distance < self.tolerance
+        # How high it has to be carried falls to 0 where it may be set down.
+        clearance = np.clip(self.distance - self.tolerance, 0.0, LIFTED)
+        self.lifted = np.clip((self.height + 0.001) / (clearance + 0.001), 0.0, 1.0)
+        self.arrived = self.above & (self.height < LOW) & (self.carried > 0)
+        gap = self.arm.joint_positions[:, RIGHT:].min(axis=1) - BLOCK[1]  # [m]
+        self.released = np.clip(gap / FREE, 0.0, 1.0)
+
+    def is_done(self) -> np.ndarray:
+        """Return where the block rests at the goal, free of the fingers."""
+        resting = np.linalg.norm(self.block.base_velocity, axis=1) < RESTING
+        return self.arrived & (self.released == 1.0) & resting
+
+    def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the stages of `Pick`, and between `carry` and `done` how low the block is and how open the fingers."""
+        lower = self.above & (self.grasped | self.arrived)
+        return {
+            **super().rewards(action),
+            "lower": lower * (1.0 - np.tanh(10.0 * self.height)),
+            "release": self.arrived * self.released,
+        }
+
+    def commands(self) -> dict[str, CommandTerm]:
+        """Return the positions of the goals on the table."""
+        return {name: term for name, term in super().commands().items() if name != "goal_z"}
+
+
+def point_down(points: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Return joint positions [rad], shape (k, 7), at which the grasp frame is at `points` [m] and the hand points down.
+
+    `turn` [rad], shape (k,), turns the hand about the vertical, 0 is that of the home position seen from the base.
+    """
+    x, y, z = points.T
+    ahead, up = np.hypot(x, y) + WRIST_AHEAD, z + WRIST_ABOVE - SHOULDER
+    upper, forearm = np.hypot(*UPPER), np.hypot(*FOREARM)
+    bend = np.arccos((ahead**2 + up**2 - upper**2 - forearm**2) / (2 * upper * forearm))
+    lean = np.arctan2(ahead, up) - np.arctan2(forearm * np.sin(bend), upper + forearm * np.cos(bend))
+    shoulder = lean - np.arctan2(*UPPER)
+    elbow = shoulder - (lean + bend - np.arctan2(*FOREARM))
+    none = np.zeros(len(points))
+    return np.column_stack([np.arctan2(y, x), shoulder, none, elbow, none, shoulder - elbow, np.pi / 4 + turn])
