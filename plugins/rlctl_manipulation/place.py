@@ -1,11 +1,11 @@
 """Place: the arm of pick.py carries a block to a goal on the table and lets go of it, in many worlds at once."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from rlctl.task import CommandTerm, WorldRngs, rewards
+from rlctl.task import CommandTerm, WorldRngs, rewards, terms
 from rlctl.task.rotations import from_axis
 from rlctl_manipulation.pick import BLOCK, GRASP, LIFTED, RIGHT, Pick
 
@@ -13,6 +13,7 @@ NEAREST = 0.1  # [m], from the block's start to the goal
 FREE = 0.005  # [m], between each finger and a block that is released
 RESTING = 0.05  # [m/s], speed of a block at rest
 LOW = 0.01  # [m], above the table: a block that falls from there stays where it is
+CLOSE_UP = 0.05  # [m], from the goal, where the block is seen at a larger scale
 CARRY_HEIGHT = 0.1  # [m], above the table, of a block in the hand at the far end of its way
 
 # The arm seen from its side, with joints 3 and 5 at 0. [m]
@@ -31,11 +32,18 @@ class Place(Pick):
     goal_high: ClassVar[np.ndarray] = np.array([0.65, 0.2, BLOCK[2]])  # [m]
     reward_weights = {**Pick.reward_weights, "lower": 0.3, "release": 0.3}
     per_world = {**Pick.per_world, "carried": ()}
+    observation_units = {**Pick.observation_units, "left": "m"}
+    observation_terms = {
+        **Pick.observation_terms,
+        # Normalised, 1 cm of the whole area is hardly anything.
+        "close_up": terms.Scaled("left", scale=(1 / CLOSE_UP,), clip=(-1.0, 1.0)),
+    }
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Start as `Pick` does; a goal that is near the block moves by half of the area, around its edges.
 
-        At level 0.6 four in ten episodes begin with the block in the hand, on the way to the goal.
+        At level 0 every second episode begins with the block in the hand at the goal, at higher levels fewer do, on the
+        way to the goal, from level 0.3 on anywhere on it.
         """
         super().reset(rng, worlds)
         goal, size = self.goal[worlds], self.goal_high - self.goal_low
@@ -43,9 +51,11 @@ class Place(Pick):
         near = rewards.distance(goal, self.block.base_position[worlds]) < NEAREST
         self.goal[worlds] = np.where(near[:, None], moved, goal)
         luck, share, turn = rng.uniform((0.0, 0.0, -0.7), (1.0, 1.0, 0.7)).T
-        held = luck >= self.level[worlds]
+        level = self.level[worlds]
+        held = luck >= 0.5 + 0.5 * level
         if held.any():
-            self.put_in_hand(worlds[held], share[held] ** 2, turn[held])
+            share *= np.minimum(level / 0.3, 1.0)
+            self.put_in_hand(worlds[held], share[held], turn[held])
 
     def put_in_hand(self, worlds: np.ndarray, share: np.ndarray, turn: np.ndarray) -> None:
         """Close the hand about the block at a `share` of the straight way from the goal back to above its start.
@@ -75,12 +85,17 @@ class Place(Pick):
         self.lifted = np.clip((self.height + 0.001) / (clearance + 0.001), 0.0, 1.0)
         self.arrived = self.above & (self.height < LOW) & (self.carried > 0)
         gap = self.arm.joint_positions[:, RIGHT:].min(axis=1) - BLOCK[1]  # [m]
-        self.released = np.clip(gap / FREE, 0.0, 1.0)
+        self.released = gap > FREE
+        self.opening = np.clip(self.target[:, RIGHT] / (BLOCK[1] + FREE), 0.0, 1.0)
+
+    def observe(self) -> dict[str, Any]:
+        """Return what `Pick` does, and how far the block is from the goal, at a larger scale."""
+        return {**super().observe(), "close_up": self.goal - self.block.base_position}
 
     def is_done(self) -> np.ndarray:
         """Return where the block rests at the goal, free of the fingers."""
         resting = np.linalg.norm(self.block.base_velocity, axis=1) < RESTING
-        return self.arrived & (self.released == 1.0) & resting
+        return self.arrived & self.released & resting
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Return the stages of `Pick`, and between `carry` and `done` how low the block is and how open the fingers."""
@@ -88,7 +103,7 @@ class Place(Pick):
         return {
             **super().rewards(action),
             "lower": lower * (1.0 - np.tanh(10.0 * self.height)),
-            "release": self.arrived * self.released,
+            "release": self.arrived * self.opening,
         }
 
     def commands(self) -> dict[str, CommandTerm]:
