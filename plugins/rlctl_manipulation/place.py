@@ -7,19 +7,24 @@ import numpy as np
 
 from rlctl.task import CommandTerm, WorldRngs, rewards, terms
 from rlctl.task.rotations import from_axis
-from rlctl_manipulation.pick import BLOCK, GRASP, LIFTED, RIGHT, Pick
+from rlctl_manipulation.pick import BLOCK, LIFTED, OPEN, RIGHT, TURN, Pick
 
 NEAREST = 0.1  # [m], from the block's start to the goal
 FREE = 0.005  # [m], between each finger and a block that is released
 RESTING = 0.05  # [m/s], speed of a block at rest
 LOW = 0.01  # [m], above the table: a block that falls from there stays where it is
 CLOSE_UP = 0.05  # [m], from the goal, where the block is seen at a larger scale
+
+# Starts of levels below 1.
+FROM_HOME = 0.3  # part of the episodes of level 0 that begin as those of level 1
+WHOLE_WAY = 0.3  # level from which starts are on the whole way; at level 0 all are at the goal
 CARRY_HEIGHT = 0.1  # [m], above the table, of a block in the hand at the far end of its way
+OVER = 0.2  # [m], above the block, of the open hand at the far end of its way
 
 # The arm seen from its side, with joints 3 and 5 at 0. [m]
 SHOULDER = 0.333  # height
 UPPER, FOREARM = np.array([0.0825, 0.316]), np.array([-0.0825, 0.384])  # forwards and up, where joints 2 and 4 are at 0
-WRIST_AHEAD, WRIST_ABOVE = -0.088, 0.207  # of the wrist, from the grasp frame of a hand that points down
+WRIST_AHEAD, WRIST_UP = -0.088, 0.207  # of the wrist, from the grasp frame of a hand that points down
 
 
 @dataclass
@@ -42,36 +47,50 @@ class Place(Pick):
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Start as `Pick` does; a goal that is near the block moves by half of the area, around its edges.
 
-        At level 0 every second episode begins with the block in the hand at the goal, at higher levels fewer do, on the
-        way to the goal, from level 0.3 on anywhere on it.
+        Below level 1 some episodes begin later on the way of a block that is placed: with the block in the hand, or with
+        the open hand over the block.
         """
         super().reset(rng, worlds)
         goal, size = self.goal[worlds], self.goal_high - self.goal_low
         moved = self.goal_low + np.fmod(goal - self.goal_low + size / 2, np.maximum(size, 1e-9))
         near = rewards.distance(goal, self.block.base_position[worlds]) < NEAREST
         self.goal[worlds] = np.where(near[:, None], moved, goal)
-        luck, share, turn = rng.uniform((0.0, 0.0, -0.7), (1.0, 1.0, 0.7)).T
+        luck, back, yaw = rng.uniform((0.0, 0.0, -TURN), (1.0, 2.0, TURN)).T
         level = self.level[worlds]
-        held = luck >= 0.5 + 0.5 * level
-        if held.any():
-            share *= np.minimum(level / 0.3, 1.0)
-            self.put_in_hand(worlds[held], share[held], turn[held])
+        later = luck >= FROM_HOME + (1.0 - FROM_HOME) * level
+        back *= np.minimum(level / WHOLE_WAY, 1.0)
+        in_hand = later & (back < 1.0)
+        over = later & (back >= 1.0)
+        if in_hand.any():
+            self.begin_in_hand(worlds[in_hand], back[in_hand], yaw[in_hand])
+        if over.any():
+            self.begin_over_block(worlds[over], back[over] - 1.0)
 
-    def put_in_hand(self, worlds: np.ndarray, share: np.ndarray, turn: np.ndarray) -> None:
+    def begin_in_hand(self, worlds: np.ndarray, share: np.ndarray, yaw: np.ndarray) -> None:
         """Close the hand about the block at a `share` of the straight way from the goal back to above its start.
 
-        The hand points down, turned by `turn` [rad].
+        Both are turned by `yaw` [rad]; each of shape (k,).
         """
+        goal = self.goal[worlds]
         start = self.block.base_position[worlds] + (0.0, 0.0, CARRY_HEIGHT)
-        point = self.goal[worlds] + share[:, None] * (start - self.goal[worlds])
-        finger = np.full(len(worlds), BLOCK[1])
-        joints = point_down(point, turn)
-        self.arm.set_joints(np.column_stack([joints, finger, finger]), worlds=worlds)
-        closing = self.look(0.0, 1.0, 0.0)[worlds]
-        yaw = np.arctan2(-closing[:, 0], closing[:, 1])
-        self.block.set_base(self.arm.link_position(GRASP)[worlds], from_axis((0, 0, 1), yaw), worlds=worlds)
-        self.target[worlds] = np.column_stack([joints, np.zeros(len(worlds))])
+        point = goal + share[:, None] * (start - goal)
+        self.set_hand(worlds, point, yaw, finger=BLOCK[1])
+        self.target[worlds, RIGHT] = 0.0
+        self.block.set_base(point, from_axis((0, 0, 1), yaw), worlds=worlds)
         self.carried[worlds] = 1.0
+
+    def begin_over_block(self, worlds: np.ndarray, share: np.ndarray) -> None:
+        """Hold the open hand over the block; where `share` is 0 around it and turned as it is, where 1 `OVER` above."""
+        point = self.block.base_position[worlds] + share[:, None] * (0.0, 0.0, OVER)
+        _, _, sin, cos = self.block.base_orientation[worlds].T
+        self.set_hand(worlds, point, (1.0 - share) * 2.0 * np.arctan2(sin, cos), finger=OPEN)
+
+    def set_hand(self, worlds: np.ndarray, points: np.ndarray, yaw: np.ndarray, *, finger: float) -> None:
+        """Move the hand, which points down, to `points` [m], and the targets with it; both fingers to `finger` [m]."""
+        joints = point_down(points, yaw)
+        fingers = np.full(len(worlds), finger)
+        self.arm.set_joints(np.column_stack([joints, fingers, fingers]), worlds=worlds)
+        self.target[worlds] = np.column_stack([joints, fingers])
 
     def measure(self) -> None:
         """Compute what rewards and success share, once per step."""
@@ -111,17 +130,18 @@ class Place(Pick):
         return {name: term for name, term in super().commands().items() if name != "goal_z"}
 
 
-def point_down(points: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def point_down(points: np.ndarray, yaw: np.ndarray) -> np.ndarray:
     """Return joint positions [rad], shape (k, 7), at which the grasp frame is at `points` [m] and the hand points down.
 
-    `turn` [rad], shape (k,), turns the hand about the vertical, 0 is that of the home position seen from the base.
+    `yaw` [rad], shape (k,), turns the hand about the vertical; at 0 its fingers close along y.
     """
     x, y, z = points.T
-    ahead, up = np.hypot(x, y) + WRIST_AHEAD, z + WRIST_ABOVE - SHOULDER
+    ahead, up = np.hypot(x, y) + WRIST_AHEAD, z + WRIST_UP - SHOULDER
     upper, forearm = np.hypot(*UPPER), np.hypot(*FOREARM)
     bend = np.arccos((ahead**2 + up**2 - upper**2 - forearm**2) / (2 * upper * forearm))
     lean = np.arctan2(ahead, up) - np.arctan2(forearm * np.sin(bend), upper + forearm * np.cos(bend))
+    turn = np.arctan2(y, x)
     shoulder = lean - np.arctan2(*UPPER)
     elbow = shoulder - (lean + bend - np.arctan2(*FOREARM))
     none = np.zeros(len(points))
-    return np.column_stack([np.arctan2(y, x), shoulder, none, elbow, none, shoulder - elbow, np.pi / 4 + turn])
+    return np.column_stack([turn, shoulder, none, elbow, none, shoulder - elbow, np.pi / 4 + turn - yaw])
