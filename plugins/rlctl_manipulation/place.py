@@ -7,7 +7,7 @@ import numpy as np
 
 from rlctl.task import CommandTerm, WorldRngs, rewards, terms
 from rlctl.task.rotations import from_axis
-from rlctl_manipulation.pick import BLOCK, LIFTED, OPEN, RIGHT, TURN, Pick
+from rlctl_manipulation.pick import BLOCK, LIFTED, RIGHT, TURN, Pick
 
 NEAREST = 0.1  # [m], from the block's start to the goal
 FREE = 0.005  # [m], between each finger and a block that is released
@@ -16,10 +16,9 @@ LOW = 0.01  # [m], above the table: a block that falls from there stays where it
 CLOSE_UP = 0.05  # [m], from the goal, where the block is seen at a larger scale
 
 # Starts of levels below 1.
-FROM_HOME = 0.3  # part of the episodes of level 0 that begin as those of level 1
+FROM_HOME = 0.5  # part of the episodes of level 0 that begin as those of level 1
 WHOLE_WAY = 0.3  # level from which starts are on the whole way; at level 0 all are at the goal
 CARRY_HEIGHT = 0.1  # [m], above the table, of a block in the hand at the far end of its way
-OVER = 0.2  # [m], above the block, of the open hand at the far end of its way
 
 # The arm seen from its side, with joints 3 and 5 at 0. [m]
 SHOULDER = 0.333  # height
@@ -35,36 +34,39 @@ class Place(Pick):
 
     goal_low: ClassVar[np.ndarray] = np.array([0.4, -0.2, BLOCK[2]])  # [m], of the area that goals are drawn from
     goal_high: ClassVar[np.ndarray] = np.array([0.65, 0.2, BLOCK[2]])  # [m]
-    reward_weights = {**Pick.reward_weights, "lower": 0.3, "release": 0.3}
-    per_world = {**Pick.per_world, "carried": ()}
+    reward_weights = {
+        **Pick.reward_weights,
+        "approach": 0.3,
+        "grasp": 0.3,
+        "lift": 0.3,
+        "lower": 0.3,
+        "release": 0.3,
+    }
     observation_units = {**Pick.observation_units, "left": "m"}
     observation_terms = {
         **Pick.observation_terms,
         # Normalised, 1 cm of the whole area is hardly anything.
         "close_up": terms.Scaled("left", scale=(1 / CLOSE_UP,), clip=(-1.0, 1.0)),
     }
+    per_world = {**Pick.per_world, "carried": ()}
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Start as `Pick` does; a goal that is near the block moves by half of the area, around its edges.
 
-        Below level 1 some episodes begin later on the way of a block that is placed: with the block in the hand, or with
-        the open hand over the block.
+        At level 0 every second episode begins with the block in the hand, at the goal. At higher levels fewer do, from
+        level 0.3 on anywhere on the way to the goal.
         """
         super().reset(rng, worlds)
         goal, size = self.goal[worlds], self.goal_high - self.goal_low
         moved = self.goal_low + np.fmod(goal - self.goal_low + size / 2, np.maximum(size, 1e-9))
         near = rewards.distance(goal, self.block.base_position[worlds]) < NEAREST
         self.goal[worlds] = np.where(near[:, None], moved, goal)
-        luck, back, yaw = rng.uniform((0.0, 0.0, -TURN), (1.0, 2.0, TURN)).T
+        luck, share, yaw = rng.uniform((0.0, 0.0, -TURN), (1.0, 1.0, TURN)).T
         level = self.level[worlds]
-        later = luck >= FROM_HOME + (1.0 - FROM_HOME) * level
-        back *= np.minimum(level / WHOLE_WAY, 1.0)
-        in_hand = later & (back < 1.0)
-        over = later & (back >= 1.0)
-        if in_hand.any():
-            self.begin_in_hand(worlds[in_hand], back[in_hand], yaw[in_hand])
-        if over.any():
-            self.begin_over_block(worlds[over], back[over] - 1.0)
+        share *= np.minimum(level / WHOLE_WAY, 1.0)
+        held = luck >= FROM_HOME + (1.0 - FROM_HOME) * level
+        if held.any():
+            self.begin_in_hand(worlds[held], share[held], yaw[held])
 
     def begin_in_hand(self, worlds: np.ndarray, share: np.ndarray, yaw: np.ndarray) -> None:
         """Close the hand about the block at a `share` of the straight way from the goal back to above its start.
@@ -74,23 +76,11 @@ class Place(Pick):
         goal = self.goal[worlds]
         start = self.block.base_position[worlds] + (0.0, 0.0, CARRY_HEIGHT)
         point = goal + share[:, None] * (start - goal)
-        self.set_hand(worlds, point, yaw, finger=BLOCK[1])
-        self.target[worlds, RIGHT] = 0.0
+        joints, finger = point_down(point, yaw), np.full(len(worlds), BLOCK[1])
+        self.arm.set_joints(np.column_stack([joints, finger, finger]), worlds=worlds)
+        self.target[worlds] = np.column_stack([joints, np.zeros_like(finger)])
         self.block.set_base(point, from_axis((0, 0, 1), yaw), worlds=worlds)
         self.carried[worlds] = 1.0
-
-    def begin_over_block(self, worlds: np.ndarray, share: np.ndarray) -> None:
-        """Hold the open hand over the block; where `share` is 0 around it and turned as it is, where 1 `OVER` above."""
-        point = self.block.base_position[worlds] + share[:, None] * (0.0, 0.0, OVER)
-        _, _, sin, cos = self.block.base_orientation[worlds].T
-        self.set_hand(worlds, point, (1.0 - share) * 2.0 * np.arctan2(sin, cos), finger=OPEN)
-
-    def set_hand(self, worlds: np.ndarray, points: np.ndarray, yaw: np.ndarray, *, finger: float) -> None:
-        """Move the hand, which points down, to `points` [m], and the targets with it; both fingers to `finger` [m]."""
-        joints = point_down(points, yaw)
-        fingers = np.full(len(worlds), finger)
-        self.arm.set_joints(np.column_stack([joints, fingers, fingers]), worlds=worlds)
-        self.target[worlds] = np.column_stack([joints, fingers])
 
     def measure(self) -> None:
         """Compute what rewards and success share, once per step."""

@@ -72,7 +72,7 @@ def test_at_low_levels_some_episodes_begin_in_the_hand_at_the_goal(script):
         np.testing.assert_allclose(task.arm.link_position("grasp")[held], task.goal[held], atol=1e-9)
         script.worlds.step(np.tile([0.0] * 7 + [CLOSED], (WORLDS, 1)).astype(np.float32))
         assert task.grasped[held].all()
-    assert 0.5 < np.mean(carried) < 0.9  # 0.7
+    assert 0.3 < np.mean(carried) < 0.7  # 0.5
 
 
 def test_a_hand_at_a_point_points_down(script):
