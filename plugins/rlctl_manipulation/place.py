@@ -36,19 +36,19 @@ class Place(Pick):
     goal_high: ClassVar[np.ndarray] = np.array([0.65, 0.2, BLOCK[2]])  # [m]
     reward_weights = {
         **Pick.reward_weights,
-        "approach": 0.3,
+        "approach": 2.0,
         "grasp": 0.3,
         "lift": 0.3,
         "lower": 0.3,
         "release": 0.3,
     }
+    per_world = {**Pick.per_world, "carried": ()}
     observation_units = {**Pick.observation_units, "left": "m"}
     observation_terms = {
         **Pick.observation_terms,
         # Normalised, 1 cm of the whole area is hardly anything.
         "close_up": terms.Scaled("left", scale=(1 / CLOSE_UP,), clip=(-1.0, 1.0)),
     }
-    per_world = {**Pick.per_world, "carried": ()}
 
     def reset(self, rng: WorldRngs, worlds: np.ndarray) -> None:
         """Start as `Pick` does; a goal that is near the block moves by half of the area, around its edges.
@@ -95,7 +95,6 @@ class Place(Pick):
         self.arrived = self.above & (self.height < LOW) & (self.carried > 0)
         gap = self.arm.joint_positions[:, RIGHT:].min(axis=1) - BLOCK[1]  # [m]
         self.released = gap > FREE
-        self.opening = np.clip(self.target[:, RIGHT] / (BLOCK[1] + FREE), 0.0, 1.0)
 
     def observe(self) -> dict[str, Any]:
         """Return what `Pick` does, and how far the block is from the goal, at a larger scale."""
@@ -109,10 +108,12 @@ class Place(Pick):
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Return the stages of `Pick`, and between `carry` and `done` how low the block is and how open the fingers."""
         lower = self.above & (self.grasped | self.arrived)
+        # The action is paid too: where it closes the fingers as hard as it can, their targets do not change with it.
+        opening = 0.5 * np.clip(self.target[:, RIGHT] / (BLOCK[1] + FREE), 0.0, 1.0) + 0.25 * (1.0 + action[:, RIGHT])
         return {
             **super().rewards(action),
             "lower": lower * (1.0 - np.tanh(10.0 * self.height)),
-            "release": self.arrived * self.opening,
+            "release": self.arrived * opening,
         }
 
     def commands(self) -> dict[str, CommandTerm]:
