@@ -36,8 +36,8 @@ class Place(Pick):
     goal_high: ClassVar[np.ndarray] = np.array([0.65, 0.2, BLOCK[2]])  # [m]
     reward_weights = {
         **Pick.reward_weights,
-        "approach": 2.0,
-        "grasp": 0.3,
+        "approach": 1.0,
+        "grasp": 0.5,
         "lift": 0.3,
         "lower": 0.3,
         "release": 0.3,
