@@ -6,13 +6,11 @@ control steps of their own here: the policy sees them, but only the descent is s
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
 
-MODELS = Path(__file__).with_name("models")
 # Seven joints of the arm, then the gripper's: turn, left finger, left tip, right finger, right tip. [rad]
 START = [0.0064, 0.4132, -0.0114, -1.5893, 0.0054, 1.1377, -0.0065, 0.0, -0.3, 0.0, 0.3, 0.0]
 ARM = [f"J{number}" for number in range(7)]
@@ -35,7 +33,7 @@ DESCENT, LIFT = 0.002, 0.004  # [m], per control step; the original lifts 1 mm i
 OPEN = 0.3  # [rad], of each finger
 CLOSING_STEPS = 25
 NEAR_TRAY = 0.08  # [m], height of the gripper
-GRASP_GAP = 0.014  # [m], between gripper and tray, at which the descent ends; closing fingers swing 12 mm lower
+GRASP_GAP = 0.005  # [m], between gripper and tray, at which the descent ends
 TOP = 0.5  # [m], where the lift of the hand ends
 BLOCK_REST = -0.175  # [m], height of the block's middle in the tray
 ALIGNED = 0.02  # [m]; so far from the block's middle, alignment is worth 1/e
@@ -98,10 +96,12 @@ class KukaGrasp(Task):
                     f"{high:g}, the lower value first."
                 )
         sim.set_gravity(10.0)
-        self.arm = sim.load("arm", MODELS / "kuka_gripper.urdf", position=BASE, fixed=True)
+        self.arm = sim.load("arm", "kuka_iiwa/kuka_with_gripper2.sdf")
+        self.arm.set_base(BASE)
         self.arm.cap_joint_speed(10.0)  # [rad/s]
-        self.tray = sim.load("tray", MODELS / "tray.urdf", position=TRAY, orientation=(0, 0, 1, 0), fixed=True)
-        self.block = sim.load("block", MODELS / "long_block.urdf")
+        self.tray = sim.load("tray", "tray/tray.urdf", position=TRAY, orientation=(0, 0, 1, 0), fixed=True)
+        # The file's inertia is that of a body of tons; see `rlctl tasks show`.
+        self.block = sim.load("block", "block.urdf", inertia="shape")
         self.all_joints = np.array(START)
         self.finger_joints = self.arm.find_joints(FINGERS)
         self.arm.set_joints(self.all_joints)

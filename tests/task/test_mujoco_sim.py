@@ -157,7 +157,7 @@ def test_events_act_in_mujoco_too():
 @pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("task", "parameters", "missing"),
-    [("tests.task.tasks:Stadium", {}, "plane_stadium.sdf: MuJoCo reads URDF and MJCF")],
+    [("kuka-grasp", {}, "kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF")],
 )
 def test_what_mujoco_has_not_is_named(task, parameters, missing):
     with pytest.raises(TaskError, match=missing):
