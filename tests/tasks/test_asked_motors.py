@@ -43,7 +43,7 @@ def test_a_dog_with_hobby_servos(tmp_path, monkeypatch):
 def test_motors_that_are_too_weak(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path)
-    plugin = new.create("my-dog", model="dog.xml", walk=True, motors="xl320")
+    plugin = new.create("weak-dog", model="dog.xml", walk=True, motors="xl320")
     assert "xl320 is too weak for it" in plugin.summary
 
 
