@@ -76,7 +76,7 @@ def test_tasks_of_a_distribution(pytester):
             assert task != "reach"
         """,
     )
-    result.assert_outcomes(passed=21, failed=1)
+    result.assert_outcomes(passed=23, failed=1)
 
 
 def test_a_distribution_without_tasks(pytester):

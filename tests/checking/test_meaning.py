@@ -101,10 +101,9 @@ def test_attributes_of_mixed_shapes_are_left_out():
     assert list(attributes) == ["self.goal"]
 
 
-def test_units_are_told_apart_by_the_time_of_a_step():
+def test_units_are_told_apart_by_the_goal():
     (finding,) = findings(f"{MEANING}:RL119RoverMillimetres", "RL119")
-    # 0.1 m in a step at 1 m/s are 100 mm; the heading changes by 0.1 times the turning rate.
-    assert finding.evidence["value"] == pytest.approx(100.0, rel=1e-3)
+    assert finding.evidence["value"] == 1000.0
     assert "millimetres" in finding.message
 
 

@@ -161,9 +161,9 @@ def test_tensors_that_do_not_fit(policy):
         check_playable(PolicyFile(file.info, tensors, Path("x.safetensors")))
 
 
-@pytest.mark.parametrize("arguments", [{}, {"use_sde": True}])
-def test_a_gaussian_policy_without_log_std(policy, arguments):
-    file, _ = policy("ppo", **arguments)
+@pytest.mark.parametrize("case", ["ppo", "ppo, gSDE"])
+def test_a_gaussian_policy_without_log_std(policy, case):
+    file, _ = policy(case)
     tensors = {name: values for name, values in file.tensors.items() if name != "policy/log_std"}
     with pytest.raises(
         ArtifactError, match=r"x.safetensors: its tensors do not fit its description: log_std is missing"

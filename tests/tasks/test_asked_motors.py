@@ -25,13 +25,13 @@ LEVER = """<mujoco model="lever"><compiler angle="radian"/><worldbody>
 def test_a_dog_with_hobby_servos(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path)
-    plugin = new.create("my-dog", model="dog.xml", walk=True, motors="sts3215", backlash="1deg")
+    plugin = new.create("servo-dog", model="dog.xml", walk=True, motors="sts3215", backlash="1deg")
     task = read_task(plugin)
     assert task.motor == "sts3215"
     assert task.motor_values == {"backlash_rad": 0.0175}  # [rad], of 1 degree
     names = ["torque_constant", "motor_bias", "voltage", "motor_friction", "backlash"]
-    assert set(names) < set(task.mydog.events)
-    assert "motor_strength" not in task.mydog.events
+    assert set(names) < set(task.servodog.events)
+    assert "motor_strength" not in task.servodog.events
     check_that_it_stands(plugin, [f"{leg}_shank" for leg in FEET], task.height)
     with contextlib.closing(EnvSpec(plugin.target, randomize=True, sim=MUJOCO).make()) as env:
         _, info = env.reset(seed=0)

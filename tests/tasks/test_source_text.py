@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from rlctl.tasks import legged_robot, new, source_text
+from rlctl.tasks import hand_robot, legged_robot, motion_robot, new, source_text
 from tests.tasks.test_new_walk import DOG, FEET, LEG, write_keyframe
 
 HOSTILE = [
@@ -27,10 +27,10 @@ HOSTILE = [
     "",
 ]
 NUMBERS = [0.5, -1e300, 1e-300, 0.0, math.inf, -math.inf, math.nan]
-TEMPLATES = [new.TEMPLATE, legged_robot.TEMPLATE]
+TEMPLATES = [new.TEMPLATE, legged_robot.TEMPLATE, hand_robot.TEMPLATE, motion_robot.TEMPLATE]
 KINDS = [
-    frozenset({"walk", "mirror", "mirror_walk", "origin"}),
-    frozenset({"clock", "aside", "mirror", "mirror_clock", "point", "mujoco"}),
+    frozenset({"walk", "mirror", "mirror_walk", "origin", "drives", "pick", "one"}),
+    frozenset({"clock", "aside", "mirror", "mirror_clock", "point", "mujoco", "motors", "place", "many"}),
 ]
 
 
@@ -64,6 +64,13 @@ CODE = {
     "fixed": ", fixed=True",
     "axes": "[:2]",
     "steps_comment": "  # CHANGE",
+    "armature_comment": "",
+    "motor": '"sts3215"',
+    "motor_comment": "# From a page.",
+    "motor_values": "{}",
+    "motor_events": '        "voltage": 1,',
+    "inclined": " down",
+    "towards_held": "+ 0",
 }
 CODE |= dict.fromkeys(
     (
@@ -83,6 +90,9 @@ CODE |= dict.fromkeys(
 )
 CODE |= dict.fromkeys(("soles", "other_side", "mirror_vector", "mirror_turn", "mirror_command", "tip_to_goal"), "[0]")
 CODE |= dict.fromkeys(("lowest", "highest"), "0.0, 1.0")
+CODE |= dict.fromkeys(("arm", "gripper", "fingers", "open", "closed", "tip_down", "tip_side", "clips", "links"), "[0]")
+CODE |= dict.fromkeys(("area_low", "area_high", "block_turn", "goal_heights"), "[0]")
+CODE |= dict.fromkeys(("camera_eye", "camera_target", "wrist_eye", "wrist_up", "tip_tuple"), "(0, 0, 1)")
 CODE |= dict.fromkeys(
     (
         *("start_noise", "tolerance", "smaller", "goal_range", "episode_s", "distance_weight", "clips_target", "reach"),
@@ -98,6 +108,8 @@ CODE |= dict.fromkeys(
         ),
         *("armature", "gear_damping", "swing", "least_swing", "speed_scale", "turn_scale", "push", "bounce_weight"),
         *("sway_weight", "height_weight", "steps_up"),
+        *("half", "width", "held", "scale", "lifted", "nearest", "noise", "released", "sag", "least_down"),
+        *("size", "substeps", "farthest"),
     ),
     "1",
 )
@@ -131,7 +143,7 @@ def test_a_hostile_text_in_every_placeholder(file, kept, text):
 def test_every_placeholder_is_known_to_this_test():
     """A new placeholder is either quoted, as `test_a_hostile_text_in_every_placeholder` shows, or is in CODE."""
     quoted = {"model", "robot", "robot_phrase", "tip", "weight", "leg", "model_robot", "pose_comment", "start_comment"}
-    quoted |= {"speed_comment", "force_comment", "stance_comment"}
+    quoted |= {"speed_comment", "force_comment", "stance_comment", "palm"}
     for folder in TEMPLATES:
         for file in folder.rglob("*.tmpl"):
             names = set(string.Template(file.read_text()).get_identifiers())
