@@ -57,6 +57,10 @@ def test_names_that_have_no_effect_are_found():
     }
 
 
+def test_a_base_class_in_another_module_may_use_a_name():
+    assert findings("rlctl_locomotion.humanoid_walk:HumanoidWalk", "RL013") == []
+
+
 def test_a_task_that_randomises_is_judged_so(rlctl):
     task = f"{FOLDER}/broken_variants.py:RL011BreaksDown"
     done = rlctl("check-env", task, "--select", "RL011,RL301", "--set", "randomize=true")
