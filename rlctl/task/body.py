@@ -435,25 +435,23 @@ class Body:
         given: dict[str, Any] = {"max_speed": speed, "max_torque": torque, "default_positions": default_positions}
         return Joints(
             names=[self.joint_names[joint] for joint in chosen],
-            **self._describe_drives(chosen),
             low=low.tolist() if bounded else (),
             high=high.tolist() if bounded else (),
-            **(given | commanded),
+            **(self._describe_drives(chosen) | given | commanded),
         )
 
-    def _describe_drives(self, joints: list[int]) -> dict[str, list[float]]:
+    def _describe_drives(self, joints: list[int]) -> dict[str, Any]:
         """Return what `Joints` has of springs, dampers and motors; what is not known of all joints is left out."""
         found: dict[str, list[float | None]] = {
             name: [] for name in ("stiffness", "damping", "drive_gain", "drive_voltage")
         }
         for joint in joints:
             motor = self.motors.get(self.joint_names[joint])
+            values: tuple[float | None, ...] = (None,) * len(found)
             if motor is not None:
                 values = motor.stiffness_nm_per_rad, motor.damping_nms_per_rad, motor.position_gain, motor.voltage_v
             elif self.drives is not None:
                 values = float(self.drives.stiffness[joint]), float(self.drives.damping[joint]), None, None
-            else:
-                values = None, None, None, None
             for name, value in zip(found, values, strict=True):
                 found[name].append(value)
         if None in found["drive_gain"]:
