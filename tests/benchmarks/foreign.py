@@ -224,7 +224,7 @@ class Trials:
         return True
 
     def judge_sound(self, name: str) -> bool:
-        """Return whether nothing is said against a policy as its files say."""
+        """Return whether the diagnosis finds no mistake in a policy that is played as its files describe."""
         result = _diagnose(self.import_named(name))
         is_right = result.best is None
         verdict = "silent" if is_right else "FALSE WORD"

@@ -10,6 +10,7 @@ import numpy as np
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco.files import ModelFile, read_model_file
+from rlctl.task.mujoco.real_motors import insert_play, set_friction_impedance
 from rlctl.task.mujoco.world import import_mujoco
 from rlctl_robot.identify.log import Array
 
@@ -22,9 +23,6 @@ OF_JOINTS = (STIFFNESS, ARMATURE, VISCOUS, COULOMB, BIAS, TORQUE, BACKLASH)
 _SHORTEST_STEP, _LONGEST_STEP = 0.0005, 0.005  # [s], of the physics
 UNLIMITED = 1e9  # [N m or N]
 _USUAL_STEP = 0.004  # of tasks with a URDF, which has none
-_FRICTION = (0.999, 0.999, 0.001, 0.5, 2)
-"""Impedance of dry friction, as of `set_motors`: with MuJoCo's default a joint that friction holds creeps."""
-_STOP = (0.99, 0.999, 0.001, 0.5, 2)  # of the ends of the play, likewise
 _LEAST_MASS = 0.01  # of the heaviest link, of a link whose mass can be estimated
 
 Values = dict[str, Array]
@@ -111,7 +109,7 @@ def read_robot(
         _add_servo(spec, name, servos[name], source)
     if plays:
         for name in kept:
-            _add_play(spec, name)
+            insert_play(mujoco, spec.joint(name), f"play of {name}", spec.option.timestep)
     model = _compile(path, spec)
     return _describe(path, model, kept, servos, source, notes)
 
@@ -165,26 +163,6 @@ def _add_servo(spec: Any, name: str, servo: tuple[float, float, float], source: 
     joint.frictionloss = max(joint.frictionloss, 1e-6)
     joint.armature = max(joint.armature, 1e-6)
     set_friction_impedance(joint, spec.option.timestep)
-
-
-def _add_play(spec: Any, name: str) -> None:
-    """Let a link move against its servo, as `set_motors` does: by a joint in series."""
-    joint = spec.joint(name)
-    joint.parent.add_joint(
-        name=f"play of {name}",
-        type=joint.type,
-        axis=joint.axis,
-        pos=joint.pos,
-        limited=int(import_mujoco().mjtLimited.mjLIMITED_TRUE),
-        range=[-1.0, 1.0],  # each world has its own
-        solref_limit=[2 * spec.option.timestep, 1.0],
-        solimp_limit=_STOP,
-    )
-
-
-def set_friction_impedance(joint: Any, timestep: float) -> None:
-    """Let dry friction of a joint of an `MjSpec` hold it where it is, for a physics step of `timestep` [s]."""
-    joint.solref_friction, joint.solimp_friction = [2 * timestep, 1.0], _FRICTION
 
 
 def _describe(

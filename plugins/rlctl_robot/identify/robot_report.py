@@ -10,6 +10,7 @@ import yaml
 from rlctl import output
 from rlctl.storage import files
 from rlctl.task.mujoco.files import read_model_file
+from rlctl.task.mujoco.real_motors import set_friction_impedance
 from rlctl.task.mujoco.world import import_mujoco
 from rlctl_robot.identify.robot import RobotIdentification, RobotValue, describe
 from rlctl_robot.identify.robot_model import (
@@ -24,7 +25,6 @@ from rlctl_robot.identify.robot_model import (
     STIFFNESS,
     TORQUE,
     VISCOUS,
-    set_friction_impedance,
 )
 
 _TITLES = {

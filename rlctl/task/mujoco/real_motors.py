@@ -39,7 +39,7 @@ def add_motors(mujoco: Any, spec: Any, body: str, motors: Mapping[str, Motor]) -
     timestep = spec.option.timestep
     for name, motor in motors.items():
         joint = spec.joint(f"{body}/{name}")
-        joint.solref_friction, joint.solimp_friction = [2 * timestep, 1.0], _FRICTION
+        set_friction_impedance(joint, timestep)
         if motor.armature_kgm2 is not None:
             joint.armature = motor.armature_kgm2  # before the compilation, which scales the stops of the play by it
         if motor.backlash_rad > 0:
@@ -70,13 +70,23 @@ def _add_play(mujoco: Any, spec: Any, body: str, name: str, timestep: float) -> 
     link = joint.parent
     if len(link.joints) > 1:
         raise TaskError(f"backlash of joint {name!r}: its link has several joints; give one link to each in the model")
-    link.add_joint(
-        name=play,
+    insert_play(mujoco, joint, play, timestep)
+
+
+def set_friction_impedance(joint: Any, timestep: float) -> None:
+    """Let dry friction of a joint of an `MjSpec` hold it where it is, for a physics step of `timestep` [s]."""
+    joint.solref_friction, joint.solimp_friction = [2 * timestep, 1.0], _FRICTION
+
+
+def insert_play(mujoco: Any, joint: Any, name: str, timestep: float) -> None:
+    """Add the play of a joint of an `MjSpec`: a joint in series, whose range is written after the compilation."""
+    joint.parent.add_joint(
+        name=name,
         type=joint.type,
         axis=joint.axis,
         pos=joint.pos,
         limited=int(mujoco.mjtLimited.mjLIMITED_TRUE),
-        range=[-1.0, 1.0],  # `set_motors` writes that of the compiled model
+        range=[-1.0, 1.0],
         solref_limit=[2 * timestep, 1.0],
         solimp_limit=_STOP,
     )
