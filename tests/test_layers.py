@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parent.parent
 
 # From the top down: a module imports rooms of lines below its own, and its own room. There are no exceptions.
@@ -54,11 +56,15 @@ MAY_IMPORT_TORCH = {  # besides training/
 
 
 @functools.cache
+def parse(file: Path) -> ast.Module:
+    return ast.parse(file.read_text())
+
+
+@functools.cache
 def imports(file: Path) -> set[str]:
     """Every module a file imports, anywhere in it: also in functions, and for types alone."""
-    tree = ast.parse(file.read_text())
     found = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(parse(file)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -206,6 +212,7 @@ def test_what_must_start_at_once():
     assert {line: modules & HEAVY for line, modules in loaded.items() if modules & HEAVY} == {}
 
 
+@pytest.mark.slow
 def test_environments_come_without_learning_libraries():
     loaded = loaded_after(
         "import rlctl; rlctl.make('reach').close()",
@@ -253,8 +260,6 @@ def test_the_check_of_docstrings_finds_what_lacks_one() -> None:
 
 def test_every_public_class_function_and_method_has_a_docstring() -> None:
     undocumented = {
-        str(file.relative_to(ROOT)): names
-        for file in files("rlctl")
-        if (names := find_undocumented(ast.parse(file.read_text()).body))
+        str(file.relative_to(ROOT)): names for file in files("rlctl") if (names := find_undocumented(parse(file).body))
     }
     assert undocumented == {}
