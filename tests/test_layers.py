@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import gc
 import json
 import re
 import subprocess
@@ -58,7 +59,9 @@ MAY_IMPORT_TORCH = {  # besides training/
 
 @functools.cache
 def parse(file: Path) -> ast.Module:
-    return ast.parse(file.read_text())
+    tree = ast.parse(file.read_text())
+    gc.freeze()  # trees stay: or collections would look through all of them for most of the time
+    return tree
 
 
 def walk_statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
