@@ -22,7 +22,7 @@ demo: $(VENV)/.installed
 test: $(VENV)/.dev
 	@said=$$(mktemp); $(MAKE) --no-print-directory lint > $$said 2>&1 & lint=$$!; \
 	trap 'kill $$lint 2> /dev/null; rm -f $$said' EXIT; \
-	$(BIN)/python -m pytest -n 3 --dist worksteal; tests=$$?; \
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal --durations 40 --durations-min 1; tests=$$?; \
 	wait $$lint; code=$$?; cat $$said; \
 	[ $$tests -eq 0 ] && [ $$code -eq 0 ]
 

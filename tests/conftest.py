@@ -20,21 +20,43 @@ import pytest
 from rlctl.processes import child_process
 from tests import fork_server
 
+gc.disable()  # until all is collected: what is imported and collected stays
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
 ALL_CORES = sorted(os.sched_getaffinity(0))
 if name := os.environ.get("PYTEST_XDIST_WORKER"):  # so what it trains and evaluates has one worker and not one per core
     os.sched_setaffinity(0, {ALL_CORES[int(name.removeprefix("gw")) % len(ALL_CORES)]})
 
 
-def pytest_collection_modifyitems(items):
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects
+def pytest_collection_modifyitems(config, items):
+    _mark_slow_rows(items, is_complete=not any("[" in argument for argument in config.args))
     if importlib.util.find_spec("pybullet") is None:
         for item in items:
             if item.get_closest_marker("pybullet"):
                 item.add_marker(pytest.mark.skip(reason="needs PyBullet, which is not installed"))
 
 
+def _mark_slow_rows(items, is_complete):
+    """Mark as slow all rows of a parametrised test but those that its `slow_except` names, which must exist."""
+    missing = set()
+    found = set()
+    for item in items:
+        marker = item.get_closest_marker("slow_except")
+        if marker is None:
+            continue
+        function, _, row = item.nodeid.removesuffix("]").partition("[")
+        missing.update((function, name) for name in marker.args)
+        found.add((function, row))
+        if row not in marker.args:
+            item.add_marker(pytest.mark.slow)
+    missing -= found
+    if missing and is_complete:
+        raise pytest.UsageError(f"slow_except names rows that do not exist: {sorted(missing)}")
+
+
 def pytest_collection_finish():
     gc.collect()
+    gc.enable()
     gc.freeze()  # modules and tests stay: collections need not look through them again and again
 
 

@@ -203,8 +203,14 @@ def close():
 
 def start(command, **options):
     """Start a child process as `subprocess.Popen` does, by a server of this process."""
-    server = for_commands if "-m" in command[1:3] and "rlctl" in command[2:4] else for_workers
+    is_command = "-m" in command[1:3] and "rlctl" in command[2:4]
+    server = for_commands if is_command or _is_training(command) else for_workers
     return server().start(command, **options)
+
+
+def _is_training(command):
+    """Return whether a command is a `ChildProcess` that trains, and starts workers of its own."""
+    return '"main": "rlctl.launching.child:main"' in command[-1]
 
 
 @contextlib.contextmanager
@@ -243,7 +249,8 @@ def serve(connection, commands=False):
             # It ends at once, so that the new process gets the caller as its parent.
             received[0]["between"] = os.getpid()
             if os.fork() == 0:
-                become(*received, write_end, _start_own_server if commands else lambda: None)
+                starts_workers = commands or _is_training(received[0]["command"])
+                become(*received, write_end, _start_own_server if starts_workers else lambda: None)
             os._exit(0)
         os.close(write_end)
         for descriptor in received[1]:
@@ -273,6 +280,7 @@ def _use_huge_pages():
 
 def main(descriptor, commands):
     """Import what the processes need, and serve."""
+    gc.disable()  # what is imported stays
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
         importlib.import_module(name)
     if commands:
@@ -284,5 +292,6 @@ def main(descriptor, commands):
                 importlib.import_module(module.name)
     gc.collect()
     gc.freeze()
+    gc.enable()
     _use_huge_pages()
     serve(socket.socket(fileno=descriptor), commands)

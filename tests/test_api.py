@@ -37,6 +37,7 @@ def test_keys_are_checked_as_on_the_command_line():
             rlctl.evaluate("reach", **given)
 
 
+@pytest.mark.slow
 def test_check_env_returns_findings(write_module):
     bad = write_module(
         "bad.py",

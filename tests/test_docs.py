@@ -264,6 +264,7 @@ def test_python_that_uses_a_run(tmp_path, rlctl, monkeypatch):
         exec(compile(block.text, str(block), "exec"), {})
 
 
+@pytest.mark.slow
 def test_python_that_needs_no_run():
     named = {text for page in PAGES for _, _, text in NAMED_FILE.findall(page.read_text())}
     blocks = [block for block in find_blocks("python") if block.text not in named and not needs_run(block)]

@@ -53,16 +53,19 @@ def test_broken_env_has_the_mistakes_that_its_text_names(tmp_path: Path) -> None
     assert findings("seeded.py:PushedBall", tmp_path, *changed) == {"RL401", "RL605"}
 
 
+@pytest.mark.slow
 def test_bare_env_is_clean(tmp_path: Path) -> None:
     assert findings(f"{EXAMPLES}/bare_env/pointmass.py:PointMass", tmp_path) == set()
 
 
+@pytest.mark.slow
 def test_reacher_of_mujoco_trains(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     preset = "presets/reacher-v5"
     rlctl("train", "Reacher-v5", "--config", preset, "-n", "1600", "--set", "eval.episodes=2", cwd=tmp_path)
 
 
+@pytest.mark.slow
 def test_bare_env_trains_by_path(tmp_path: Path) -> None:
     small = ["--set", "algo_kwargs.n_steps=25", "--set", "algo_kwargs.batch_size=100", "--set", "eval.episodes=4"]
     task = f"{EXAMPLES}/bare_env/pointmass.py:PointMass"
@@ -189,11 +192,13 @@ def test_the_check_env_action_runs(tmp_path: Path) -> None:
     assert json.loads(Path(outputs["report"]).read_text())["findings"] == []
 
 
+@pytest.mark.slow
 def test_arguments_of_the_action_may_have_several_lines(tmp_path: Path) -> None:
     assert run_action(tmp_path, "pointmass.py:Nobody", "--select RL99")[0] == 2
     assert run_action(tmp_path, "pointmass.py:Nobody", "--select RL99\n--help")[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_the_action_comments_on_the_check_that_it_ran(tmp_path: Path) -> None:
     report = tmp_path / "check-env-pointmass.py-Nobody.json"

@@ -93,6 +93,7 @@ def test_the_table(rlctl, site):
     assert row.split() == ["good", "sac", "some-robots", "1.2"]
 
 
+@pytest.mark.slow
 def test_check_shows_what_raises_in_a_line_each(importable, monkeypatch):
     monkeypatch.syspath_prepend(importable)
     monkeypatch.setenv("PYTHONPATH", str(importable))
@@ -117,6 +118,7 @@ def test_the_check_of_all_tasks(rlctl, importable):
     assert [name for (name, origin), task in tasks.items() if origin == "rlctl" and task["problem"]] == []
 
 
+@pytest.mark.slow
 def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
     (importable / "some_robots" / "raises.yaml").unlink()
     code = (

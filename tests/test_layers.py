@@ -2,11 +2,15 @@
 
 import ast
 import functools
+import gc
 import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 
@@ -54,11 +58,25 @@ MAY_IMPORT_TORCH = {  # besides training/
 
 
 @functools.cache
+def parse(file: Path) -> ast.Module:
+    tree = ast.parse(file.read_text())
+    gc.freeze()  # trees stay: or collections would look through all of them for most of the time
+    return tree
+
+
+def walk_statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield statements and those inside of them; `ast.walk` takes seconds for all their expressions."""
+    for node in body:
+        yield node
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            yield from walk_statements(getattr(node, part, []))
+
+
+@functools.cache
 def imports(file: Path) -> set[str]:
     """Every module a file imports, anywhere in it: also in functions, and for types alone."""
-    tree = ast.parse(file.read_text())
     found = set()
-    for node in ast.walk(tree):
+    for node in walk_statements(parse(file).body):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -206,6 +224,7 @@ def test_what_must_start_at_once():
     assert {line: modules & HEAVY for line, modules in loaded.items() if modules & HEAVY} == {}
 
 
+@pytest.mark.slow
 def test_environments_come_without_learning_libraries():
     loaded = loaded_after(
         "import rlctl; rlctl.make('reach').close()",
@@ -253,8 +272,6 @@ def test_the_check_of_docstrings_finds_what_lacks_one() -> None:
 
 def test_every_public_class_function_and_method_has_a_docstring() -> None:
     undocumented = {
-        str(file.relative_to(ROOT)): names
-        for file in files("rlctl")
-        if (names := find_undocumented(ast.parse(file.read_text()).body))
+        str(file.relative_to(ROOT)): names for file in files("rlctl") if (names := find_undocumented(parse(file).body))
     }
     assert undocumented == {}

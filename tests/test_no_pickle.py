@@ -42,6 +42,7 @@ def watched(folder, *commands):
     return json.loads(printed[-1][1:])
 
 
+# Takes seconds, and runs in every `make test`: nothing else guards that no command unpickles.
 def test_the_life_of_a_run(tmp_path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(

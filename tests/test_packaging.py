@@ -1,6 +1,5 @@
 """What is declared, what is packed, and what CI caches."""
 
-import ast
 import importlib.metadata
 import re
 import shutil
@@ -15,6 +14,7 @@ from hatchling.builders.sdist import SdistBuilder
 
 from rlctl import errors
 from rlctl.errors import explain_missing_package
+from tests.test_layers import files, imports
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -26,33 +26,30 @@ def normalize(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def list_imports(folder: str) -> set[str]:
-    names: set[str] = set()
-    for file in (ROOT / folder).rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                names |= {alias.name for alias in node.names}
-            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                names.add(node.module)
-    return names
-
-
 def test_every_import_is_a_declared_dependency():
     extras = [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
     declared = {normalize(re.match(r"[\w.-]+", line)[0]) for line in [*PROJECT["dependencies"], *extras]}
-    providers = importlib.metadata.packages_distributions()
+    provided = {package for name in declared for package in list_packages(name)}
     undeclared = set()
-    for name in list_imports("rlctl") | list_imports("plugins"):
+    for name in set().union(*(imports(file) for folder in ("rlctl", "plugins") for file in files(folder))):
         top = name.partition(".")[0]
-        distributions = providers.get("google.protobuf" if name.startswith("google.protobuf") else top, [])
-        if name.startswith("google.protobuf"):
-            distributions = ["protobuf"]
         of_rlctl = top in ("rlctl", "rlctl_manipulation", "rlctl_locomotion", "rlctl_robot")
         if of_rlctl or top in sys.stdlib_module_names or top in OF_USERS:
             continue
-        if not declared & {normalize(distribution) for distribution in distributions}:
+        if top not in provided or (top == "google" and not name.startswith("google.protobuf")):
             undeclared.add(name)
     assert undeclared == set()
+
+
+def list_packages(name: str) -> set[str]:
+    """Return the importable names of an installed distribution; none of one that is not installed."""
+    try:
+        distribution = importlib.metadata.distribution(name)
+    except importlib.metadata.PackageNotFoundError:
+        return set()
+    record = distribution.read_text("RECORD") or ""  # `distribution.files` looks at each file, of thousands
+    paths = [line.partition(",")[0] for line in record.splitlines()]
+    return {path.partition("/")[0].removesuffix(".py") for path in paths}
 
 
 def test_no_folder_of_the_sdist_has_a_readme_alone():

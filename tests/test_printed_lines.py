@@ -2,6 +2,8 @@
 
 import os
 
+import pytest
+
 from rlctl import printed_lines
 from rlctl.printed_lines import MAX_LINE_BYTES, MAX_LINES_PER_S, PrintedLines
 
@@ -104,6 +106,7 @@ def test_what_would_upset_a_terminal():
     assert forward_lines(b"\x1b[33mWARN: old\x1b[0m\n\x1b]0;title\x07\n") == ["WARN: old"]
 
 
+@pytest.mark.slow
 def test_a_flood_is_counted():
     lines = forward_lines(b"".join(b"%d\n" % number for number in range(200_000)) + b"z" * 10 * MAX_LINE_BYTES)
     assert lines[:2] == ["0", "1"]
@@ -116,6 +119,7 @@ def test_a_flood_is_counted():
     assert MAX_LINES_PER_S < len(lines) < 200_000 / 10
 
 
+@pytest.mark.slow
 def test_nobody_to_tell():
     def closed(_):
         raise BrokenPipeError

@@ -41,6 +41,7 @@ def run(pytester, test):
     return pytester.runpytest_inprocess("-p", "no:rlctl", "-p", "rlctl.pytest_plugin", "-p", "no:cacheprovider")
 
 
+@pytest.mark.slow
 def test_findings_fail_a_test(robots):
     known = {"fingerprint": "robots.py:NotFinite RL601"}
     robots.path.joinpath("baseline.json").write_text(json.dumps({"findings": [known], "known": []}))

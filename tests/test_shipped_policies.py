@@ -44,6 +44,7 @@ def check_score(task: str, info: PolicyInfo, episodes: int = 20) -> None:
             pytest.fail(f"{task}: {name} is {now} over {episodes} episodes, its metadata has {before}. {advice}")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize(
     "task", [pytest.param(task, marks=[] if task == "reach" else pytest.mark.slow) for task in OURS]
@@ -94,6 +95,7 @@ def test_what_is_not_shipped():
         find_shipped_policy("raech")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_actor_of_a_run_and_its_score(tmp_path):
     run = RunDirectory(tmp_path / "reach" / "2026-01-01_00-00-00_s3")
@@ -128,6 +130,7 @@ def test_the_actor_of_a_run_and_its_score(tmp_path):
         export_actor(ExportRequest(str(tmp_path / "policy.onnx"), checkpoint="best", policy=target))
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_shipped_policy_is_measured_anew(tmp_path):
     shipped = PolicyFile.read_info(find_shipped_policy("reach")).provenance
@@ -171,6 +174,7 @@ def write_push_policy(path, size):
     PolicyFile(info, {f"policy/{k}": v.numpy() for k, v in build_network(info).state_dict().items()}).write(path)
 
 
+@pytest.mark.slow
 def test_a_plugin_ships_a_policy_and_its_task_changes(rlctl, install):
     site = install("pushing", {"push": "pushing:Push"}, {"pushing.py": PUSH})
     none = rlctl("eval", "push", "--pretrained", path=site)

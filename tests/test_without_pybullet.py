@@ -35,6 +35,7 @@ def test_a_task_with_a_model_of_pybullet_names_what_is_missing(rlctl_without):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_a_policy_of_pybullet_acts_in_mujoco_with_a_warning(rlctl_without):
     done = rlctl_without("eval", "reach", "--pretrained", "--episodes", "4", "--min-success", "1")
     assert done.returncode == 0, done.stderr

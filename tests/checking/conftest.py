@@ -12,7 +12,10 @@ pytest.register_assert_rewrite("tests.checking.judging")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark what needs PyBullet, and let one mistake for each rule be quick; all are in test_all_rules.py, slow."""
+    """Mark what needs PyBullet, and as slow all but the first quick mistake for each rule.
+
+    All are in test_all_rules.py, slow.
+    """
     rules = set()
     for item in items:
         if item.name.startswith("test_finds_the_mistake_and_only_that"):
@@ -20,6 +23,8 @@ def pytest_collection_modifyitems(items):
             if case.needs_pybullet:
                 item.add_marker(pytest.mark.pybullet)
             if "test_all_rules" in item.nodeid:
+                continue
+            if item.get_closest_marker("slow"):
                 continue
             if rules.issuperset(case.rules):
                 item.add_marker(pytest.mark.slow)

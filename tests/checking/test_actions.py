@@ -17,7 +17,7 @@ CASES = [
     case(f"{FILE}:RL701CopiedAction", ("RL701", "info")),
     case(f"{FILE}:RL701OnlyCosts", ("RL701", "error"), twin=f"{FILE}:RL701Switch"),
     case(f"{FILE}:RL701OnlyCopies", ("RL701", "error"), twin=f"{FILE}:RL701Switch"),
-    case(f"{FILE}:RL705ChangesAction", ("RL705", "warning")),
+    case(f"{FILE}:RL705ChangesAction", ("RL705", "warning"), slow=True),
     case(f"{FILE}:RL705ChangesPartOfAction", ("RL705", "warning")),
     case("broken_robots.py:RL701ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
     case("broken_robots.py:RL701BoatForwardOnly", ("RL701", "info"), twin="robots.py:Boat"),
@@ -36,6 +36,7 @@ def test_actions_are_not_judged_where_step_returns_nothing_to_read():
     assert "(RL201)" in verdict.not_judged["RL701"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", CLEAN)
 def test_clean_is_clean(task):
     assert found(task, *rules_of("RL7")) == set()

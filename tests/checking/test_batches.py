@@ -35,6 +35,13 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
+@pytest.mark.slow_except(
+    "broken_batches.py:Point",
+    "broken_batches.py:RL406ScalesByEach",
+    "broken_batches.py:RL407ResetsItsGoal",
+    "broken_batches.py:RL407MovesItsBase",
+    "broken_batches.py:RL409CountsStepsOfEach",
+)
 @pytest.mark.parametrize("task", ["walk", *CLEAN])
 def test_a_sound_task_has_no_finding_of_batches(task):
     assert found(task, "RL406", "RL407", "RL408", "RL409") == set()

@@ -31,6 +31,7 @@ def test_waiting_for_a_processor_does_not_count(busy):
     assert sum(spent) < 2 * (time.monotonic() - begun)  # one processor for three: each has a third of it, or less
 
 
+@pytest.mark.slow
 def test_what_the_clock_cut_off_is_not_judged():
     """As in `NothingHappens`, what never happened is a finding only of experiments that came to their end."""
     of_absence = {"RL110", "RL501", "RL611", "RL612"}

@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 import jsonschema
 import pydantic
 import pytest
-import sarif_pydantic
 import typer
 from gymnasium import spaces
 
@@ -106,6 +105,8 @@ def extras(model):
 
 
 def test_every_report_is_valid_sarif(report):
+    import sarif_pydantic  # takes half a second
+
     log = sarif_pydantic.Sarif.model_validate_json(tool_formats.to_sarif(report))
     assert extras(log) <= NOT_IN_THE_VALIDATOR
     assert log.version == "2.1.0"
@@ -128,6 +129,12 @@ def test_sarif_places_a_finding_at_the_method(broken):
     assert result["level"] == "error"
 
 
+@pytest.mark.slow_except(
+    "broken_waivers.py:Wide-RL106-self.action_space = spaces.Box",
+    'broken_loading.py:RL002Raising-RL002-raise RuntimeError("no licence")',
+    "broken_import.py:RL001Anything-RL001-raise ZeroDivisionError",
+    "broken_repeats.py:RL301RL309GlobalRandom-RL301-def reset(self",
+)
 @pytest.mark.parametrize(
     ("task", "rule", "line"),
     [
@@ -257,12 +264,13 @@ def test_command_explains_a_rule_without_a_task():
     assert rlctl().returncode == 2
 
 
+@pytest.mark.slow
 def test_command_writes_a_file_whole_and_says_so(tmp_path):
     file = tmp_path / "report.sarif"
     run = rlctl(f"{HERE}/broken_envs.py:RL601NanReward", "--select", "RL601", "--format", "sarif", "-o", str(file))
     assert (run.returncode, run.stdout) == (1, "")
     assert run.stderr.rstrip().endswith(f"written to {file}")
-    assert sarif_pydantic.Sarif.model_validate_json(file.read_text()).runs[0].results[0].rule_id == "RL601"
+    assert json.loads(file.read_text())["runs"][0]["results"][0]["ruleId"] == "RL601"
 
 
 def test_junit_counts_what_it_lists(report):

@@ -12,7 +12,7 @@ def broken(name, *expected, twin, **settings):
 
 
 CASES = [
-    broken("RL122CrawlerSeesLate", ("RL122", "warning"), twin="FallingCrawler", pybullet=True),
+    broken("RL122CrawlerSeesLate", ("RL122", "warning"), twin="FallingCrawler", pybullet=True, slow=True),
     broken("RL122HopperSeesLate", ("RL122", "warning"), twin="FallingHopper", slow=True),
     broken("RL501HopperTimeIsUp", ("RL501", "warning"), twin="RL501HopperStandsStill", slow=True),
     broken("RL501CrawlerTimeIsUp", ("RL501", "warning"), twin="FallingCrawler", pybullet=True, slow=True),
@@ -38,6 +38,7 @@ def test_the_first_late_command_is_placed():
     assert finding.message.endswith("so it is 21 of 21 times")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_robot_is_held_without_another_experiment():
     records = shared_records_of(f"{HELD}:FallingCrawler", "held")
@@ -45,6 +46,7 @@ def test_a_robot_is_held_without_another_experiment():
     assert records.trajectories == []
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_what_lives_by_itself_is_not_held():
     verdict = verdict_of("robots.py:Crawler", "RL122")

@@ -49,12 +49,14 @@ def test_pictures_are_told():
     assert message.startswith("with render_mode='rgb_array' render returns a NoneType")
 
 
+@pytest.mark.slow
 def test_gymnasiums_own_generator_has_no_place():
     (finding,) = findings(f"{FILE}:ForgetsSeed", "RL311")
     assert finding.message.startswith("self._np_random is used")
     assert finding.where is None
 
 
+@pytest.mark.slow
 def test_types_have_an_article():
     assert messages("CountsAsFlag", "RL204") == ["terminated is an int at step 1"]
 
@@ -72,6 +74,7 @@ def test_no_limit_is_told_with_what_is_known():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("name", "rule", "severity", "text"),
@@ -90,6 +93,7 @@ def test_what_ends_the_process_is_said_once(name, rule, severity, text, monkeypa
     assert text in finding.message
 
 
+@pytest.mark.slow
 def test_what_ends_the_process_leaves_nothing_else_unjudged():
     """Another process does what comes after asking for rewards, which ends the first."""
     task = str(Path(__file__).parent / "broken_goals.py") + ":EndsInComputeReward"
@@ -100,6 +104,7 @@ def test_what_ends_the_process_leaves_nothing_else_unjudged():
     assert (verdict.judged, verdict.not_judged.keys()) == (["RL208", "RL405"], {"RL614"})
 
 
+@pytest.mark.slow
 def test_what_ends_the_process_while_rendering_is_an_error():
     task = str(Path(__file__).parent / FILE) + ":EndsInRender"
     (finding,) = check(EnvSpec(task), env_timeout_s=10, rules=["RL208", "RL215"]).verdict.findings
@@ -107,6 +112,7 @@ def test_what_ends_the_process_while_rendering_is_an_error():
     assert finding.message == "rendering without a window: the process ended with exit code 9 in render"
 
 
+@pytest.mark.slow
 def test_flags_per_agent_are_of_a_wrong_type_and_end_nothing():
     verdict = verdict_of(f"{FILE}:FlagsPerAgent", "RL204", "RL502", "RL504")
     assert [finding.rule for finding in verdict.findings] == ["RL204", "RL204"]

@@ -25,18 +25,19 @@ def broken(name, *expected, twin, file=MEANING, **settings):
 
 CASES = [
     broken("RL616RoverLateReward", ("RL616", "warning"), twin="Rover", slow=True),
-    broken("RL616DroneLateReward", ("RL616", "warning"), twin="Drone"),
-    broken("RL617RoverLateSuccess", ("RL617", "warning"), twin="Rover"),
-    broken("RL617DroneLeavesLate", ("RL617", "warning"), twin="RL617DroneLeaves"),
+    broken("RL616DroneLateReward", ("RL616", "warning"), twin="Drone", slow=True),
+    broken("RL617RoverLateSuccess", ("RL617", "warning"), twin="Rover", slow=True),
+    broken("RL617DroneLeavesLate", ("RL617", "warning"), twin="RL617DroneLeaves", slow=True),
     broken("RL618RoverLooksRound", ("RL618", "warning"), twin="RL618RoverLooks", slow=True),
-    broken("RL618DroneTurnsBack", ("RL618", "warning"), twin="RL618DroneTurns"),
+    broken("RL618DroneTurnsBack", ("RL618", "warning"), twin="RL618DroneTurns", slow=True),
     broken("RL619RoverBehindTheShore", ("RL619", "warning"), twin="RL619RoverInPond", slow=True),
-    broken("RL619ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH),
+    broken("RL619ArmFarGoals", ("RL619", "warning"), twin="Arm", file=REACH, slow=True),
     case(
         "broken_reach_bullet.py:RL619ReacherFarGoals",
         ("RL619", "warning"),
         twin="broken_reach_bullet.py:Reacher",
         pybullet=True,
+        slow=True,
     ),
     broken("RL121RoverLosesItsGoal", ("RL121", "warning"), twin="RL121RoverSeesBadly"),
     broken("RL121ArmMovesItsGoal", ("RL121", "warning"), twin="Arm", file=REACH, slow=True),
@@ -45,7 +46,7 @@ CASES = [
     broken("RL623RoverShakes", ("RL623", "warning"), twin="RL623RoverComesNearer"),
     broken("RL623ArmShakes", ("RL623", "warning"), twin="RL623ArmComesNearer", file=REACH, slow=True),
     broken("RL119RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover", slow=True),
-    broken("RL119DroneDegrees", ("RL119", "warning"), twin="RL119DroneRadians"),
+    broken("RL119DroneDegrees", ("RL119", "warning"), twin="RL119DroneRadians", slow=True),
 ]
 
 
@@ -101,6 +102,7 @@ def test_attributes_of_mixed_shapes_are_left_out():
     assert list(attributes) == ["self.goal"]
 
 
+@pytest.mark.slow
 def test_units_are_told_apart_by_the_goal():
     (finding,) = findings(f"{MEANING}:RL119RoverMillimetres", "RL119")
     assert finding.evidence["value"] == 1000.0
@@ -134,6 +136,7 @@ def test_where_nothing_changes_nothing_has_a_rate(rows, columns, last):
     assert list(find_rates(steps)) == []
 
 
+@pytest.mark.slow
 def test_jump_of_an_angle_is_measured():
     (finding,) = findings(f"{MEANING}:RL618RoverLooksRound", "RL618")
     # 0.3 times a change of the difference by 2 pi, at most.

@@ -21,42 +21,47 @@ def broken_joints(name, rule, twin, severity="warning", **settings):
 
 CASES = [
     broken("RL116ArmQuaternion", "RL116", "error", "RL116ArmRightQuaternion", slow=True),
-    broken("RL116HopperQuaternion", "RL116", "error"),
-    broken("RL116HopperVelocity", "RL116", "error", "RL116HopperRightVelocity"),
-    broken("RL116HopperHeading", "RL116", "error", "RL116HopperRightHeading"),
-    broken("RL804ArmBeyondLimits", "RL804"),
+    broken("RL116HopperQuaternion", "RL116", "error", slow=True),
+    broken("RL116HopperVelocity", "RL116", "error", "RL116HopperRightVelocity", slow=True),
+    broken("RL116HopperHeading", "RL116", "error", "RL116HopperRightHeading", slow=True),
+    broken("RL804ArmBeyondLimits", "RL804", slow=True),
     broken("RL805HopperExplodes", "RL805", slow=True),
     broken("RL807HopperInTheGround", "RL807", slow=True),
-    broken("RL813ArmLongSteps", "RL813"),
-    broken("RL814ArmWeakMotors", "RL814"),
+    broken("RL813ArmLongSteps", "RL813", slow=True),
+    broken("RL814ArmWeakMotors", "RL814", slow=True),
     broken("RL810ArmDegrees", "RL810", "error"),
-    broken("RL810ArmRangeInDegrees", "RL810", "error", "ArmRange"),
-    broken("RL810ArmRangeOfActuatorInDegrees", "RL810"),
-    broken("RL810ArmObservesRadiansOfRadians", "RL810", "error"),
-    broken("RL810HopperStartsInDegrees", "RL810", "error"),
-    broken("RL811ArmOrder", "RL811", "error"),
-    broken("RL811ArmOrderOfRanges", "RL811", "error", "ArmRange"),
-    broken("RL811HopperOrder", "RL811", "error"),
+    broken("RL810ArmRangeInDegrees", "RL810", "error", "ArmRange", slow=True),
+    broken("RL810ArmRangeOfActuatorInDegrees", "RL810", slow=True),
+    broken("RL810ArmObservesRadiansOfRadians", "RL810", "error", slow=True),
+    broken("RL810HopperStartsInDegrees", "RL810", "error", slow=True),
+    broken("RL811ArmOrder", "RL811", "error", slow=True),
+    broken("RL811ArmOrderOfRanges", "RL811", "error", "ArmRange", slow=True),
+    broken("RL811HopperOrder", "RL811", "error", slow=True),
     broken("RL812ArmTouchesWithPalm", "RL812", twin="RL812ArmTouchesWithFinger", slow=True),
-    broken("RL812HopperOtherSoles", "RL812", twin="RL812HopperThighs"),
-    broken("RL815ArmOldTip", "RL815"),
-    broken("RL815ArmOldSensor", "RL815", twin="RL815ArmRightSensor"),
-    broken("RL815ArmResetsWithoutForward", "RL815"),
-    broken("RL815ArmForwardTooEarly", "RL815"),
-    broken("RL815HopperStateInTheLoop", "RL815"),
-    broken("RL816ArmBeyondRange", "RL816"),
-    broken("RL816HopperTorqueBeyondRange", "RL816", twin="RL816HopperTorque"),
-    broken("RL817ArmGrowsHeavy", "RL817", "error", "RL817ArmNominalMass"),
-    broken("RL817HopperSlips", "RL817", "error", "RL817HopperFriction"),
-    broken("RL302ArmKeepsActivation", "RL302", "error", "RL302ArmResets"),
+    broken("RL812HopperOtherSoles", "RL812", twin="RL812HopperThighs", slow=True),
+    broken("RL815ArmOldTip", "RL815", slow=True),
+    broken("RL815ArmOldSensor", "RL815", twin="RL815ArmRightSensor", slow=True),
+    broken("RL815ArmResetsWithoutForward", "RL815", slow=True),
+    broken("RL815ArmForwardTooEarly", "RL815", slow=True),
+    broken("RL815HopperStateInTheLoop", "RL815", slow=True),
+    broken("RL816ArmBeyondRange", "RL816", slow=True),
+    broken("RL816HopperTorqueBeyondRange", "RL816", twin="RL816HopperTorque", slow=True),
+    broken("RL817ArmGrowsHeavy", "RL817", "error", "RL817ArmNominalMass", slow=True),
+    broken("RL817HopperSlips", "RL817", "error", "RL817HopperFriction", slow=True),
+    broken("RL302ArmKeepsActivation", "RL302", "error", "RL302ArmResets", slow=True),
     broken("RL301HopperKeepsTime", "RL301", "error", "RL301HopperResets", slow=True),
     broken("RL818ArmInverse", "RL818", twin="RL818ArmActuator", slow=True),
-    broken("RL818HopperForces", "RL818", twin="RL818HopperRightForces"),
-    case("broken_mujoco_joints.py:RL804ArmLimitsInRadians", ("RL804", "warning"), twin="mujoco_robots.py:MujocoArm"),
-    broken_joints("RL811ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error"),
-    broken_joints("RL811HopperIncrementsInOtherOrder", "RL811", "RL811HopperIncrements", "error"),
-    broken_joints("RL816ArmIncrementsTooFar", "RL816", "ArmIncrements"),
-    broken_joints("RL119HopperInDegrees", "RL119", "HopperObserves"),
+    broken("RL818HopperForces", "RL818", twin="RL818HopperRightForces", slow=True),
+    case(
+        "broken_mujoco_joints.py:RL804ArmLimitsInRadians",
+        ("RL804", "warning"),
+        twin="mujoco_robots.py:MujocoArm",
+        slow=True,
+    ),
+    broken_joints("RL811ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error", slow=True),
+    broken_joints("RL811HopperIncrementsInOtherOrder", "RL811", "RL811HopperIncrements", "error", slow=True),
+    broken_joints("RL816ArmIncrementsTooFar", "RL816", "ArmIncrements", slow=True),
+    broken_joints("RL119HopperInDegrees", "RL119", "HopperObserves", slow=True),
     broken_joints("RL819HopperSpeedsInOtherOrder", "RL819", "HopperObserves", slow=True),
     broken_joints("RL820ArmVelocityOfSubsteps", "RL820", "RL820ArmVelocity", slow=True),
 ]
@@ -111,6 +116,7 @@ def test_finding_names_what_is_wrong(name, rule, words):
     assert [word for word in words if word not in messages] == []
 
 
+@pytest.mark.slow
 def test_rules_that_compare_repeated_episodes_say_why_they_could_not():
     """RL815 would be a pass that nobody judged."""
     verdict = judge(records_of("broken_mujoco.py:ArmOldTipAtRandom", "build", "worlds"), ["RL815"])
@@ -118,6 +124,7 @@ def test_rules_that_compare_repeated_episodes_say_why_they_could_not():
     assert verdict.not_judged == {"RL815": "an episode with the same seed and actions is not the same again (RL302)"}
 
 
+@pytest.mark.slow
 def test_a_fix_names_the_calls_of_the_own_engine():
     [finding] = findings("broken_mujoco.py:RL815HopperStateInTheLoop", "RL815")
     assert "mj_forward" in finding.fix

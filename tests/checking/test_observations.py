@@ -6,9 +6,9 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 
 BROKEN = "broken_observations.py"
 CASES = [
-    case(f"{BROKEN}:RL110ConstantElement", ("RL110", "info"), twin=f"{BROKEN}:Wide"),
-    case(f"{BROKEN}:RL110ConstantCounter", ("RL110", "info"), twin=f"{BROKEN}:RL110Counter"),
-    case(f"{BROKEN}:RL110ConstantSpeed", ("RL110", "warning"), twin=f"{BROKEN}:RL110Speed"),
+    case(f"{BROKEN}:RL110ConstantElement", ("RL110", "info"), twin=f"{BROKEN}:Wide", slow=True),
+    case(f"{BROKEN}:RL110ConstantCounter", ("RL110", "info"), twin=f"{BROKEN}:RL110Counter", slow=True),
+    case(f"{BROKEN}:RL110ConstantSpeed", ("RL110", "warning"), twin=f"{BROKEN}:RL110Speed", slow=True),
     case(f"{BROKEN}:RL114HiddenGoal", ("RL114", "warning"), twin=f"{BROKEN}:RL114SeenGoal"),
     case(f"{BROKEN}:RL114HiddenGoalNoisyStart", ("RL114", "warning"), twin=f"{BROKEN}:RL114NoisyReward"),
 ]
@@ -42,6 +42,7 @@ def finding_of(name):
     return finding
 
 
+@pytest.mark.slow
 def test_constant_elements_are_named_with_their_value():
     finding = finding_of("RL110ConstantElement")
     assert finding.message == "1 of 4 elements of the observation never changed: observation[2] (0.25)"

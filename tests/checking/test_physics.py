@@ -14,14 +14,19 @@ from tests.checking.judging import case, check_case, findings, found, mark_slow,
 RULES = set(rules_of("RL8"))
 CART = "broken_physics.py:Cart"
 CASES = [
-    case("broken_physics.py:RL801NoGravity", ("RL801", "warning"), twin="broken_physics.py:RL801Flat"),
+    case("broken_physics.py:RL801NoGravity", ("RL801", "warning"), twin="broken_physics.py:RL801Flat", slow=True),
     case("broken_physics.py:RL803InTheFloor", ("RL803", "warning"), twin=CART, slow=True),
-    case("broken_physics.py:RL804BeyondLimits", ("RL804", "warning"), twin="broken_physics.py:RL804TurnsWithoutEnd"),
-    case("broken_physics.py:RL805Explodes", ("RL805", "warning"), twin=CART),
-    case("broken_physics.py:RL813LongPhysicsSteps", ("RL813", "warning"), twin=CART),
-    case("broken_physics.py:RL807StartsInTheFloor", ("RL807", "warning"), twin=CART),
-    case("broken_models.py:RL809HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask"),
-    case("broken_models.py:RL809TipWithoutInertial", ("RL809", "info"), twin="broken_models.py:CartTask"),
+    case(
+        "broken_physics.py:RL804BeyondLimits",
+        ("RL804", "warning"),
+        twin="broken_physics.py:RL804TurnsWithoutEnd",
+        slow=True,
+    ),
+    case("broken_physics.py:RL805Explodes", ("RL805", "warning"), twin=CART, slow=True),
+    case("broken_physics.py:RL813LongPhysicsSteps", ("RL813", "warning"), twin=CART, slow=True),
+    case("broken_physics.py:RL807StartsInTheFloor", ("RL807", "warning"), twin=CART, slow=True),
+    case("broken_models.py:RL809HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask", slow=True),
+    case("broken_models.py:RL809TipWithoutInertial", ("RL809", "info"), twin="broken_models.py:CartTask", slow=True),
 ]
 
 
@@ -33,6 +38,7 @@ def test_finds_the_mistake_and_only_that(case):
 CLEAN = ["broken_physics.py:FixedCart", "broken_physics.py:ThroughBulletClient"]
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize("task", CLEAN)
 def test_worlds_without_a_mistake_are_clean(task):
@@ -43,6 +49,7 @@ def the_finding(name):
     return next(each for each in findings(f"broken_physics.py:{name}", *sorted(RULES)) if each.rule in RULES)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_joint_beyond_its_limits_is_placed():
     finding = the_finding("RL804BeyondLimits")
@@ -54,6 +61,7 @@ def test_joint_beyond_its_limits_is_placed():
     assert {"seed", "episode", "step"} <= finding.evidence.keys()
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_penetration_is_measured():
     finding = the_finding("RL803InTheFloor")
@@ -72,6 +80,7 @@ def test_explosion_is_measured():
     assert finding.message.startswith("link0 moves at 173.")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_calls_that_run_without_the_client_are_found():
     assert found("broken_physics.py:ForgetsClient", "RL808") == {("RL808", "error")}
@@ -115,6 +124,7 @@ def test_calls_are_recorded_as_they_are_meant(tmp_path):
     assert inspect.isbuiltin(pybullet.stepSimulation)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_frame_without_inertial_is_named():
     (finding,) = findings("broken_models.py:RL809TipWithoutInertial", "RL809")

@@ -85,6 +85,7 @@ def test_hang_is_a_finding_after_the_timeout(in_root):
     assert report.exit_code == 1
 
 
+@pytest.mark.slow
 def test_a_first_call_that_hangs_ends_the_process_once(in_root):
     report = check(EnvSpec(f"{BROKEN}:HangsAtOnce"), env_timeout_s=0.2)
     (finding,) = report.verdict.findings
@@ -127,6 +128,7 @@ def test_printing_is_worth_knowing_and_does_not_reach_the_result(in_root):
     assert run.returncode == 0
 
 
+@pytest.mark.slow
 def test_hash_order_shows_in_a_new_process(in_root):
     report = check(
         EnvSpec("tests/checking/broken_repeats.py:RL305HashOrder"), rules=choose_rules(["RL3"]), env_timeout_s=10
@@ -143,6 +145,7 @@ def test_unknown_names_are_usage_errors(in_root):
         check(EnvSpec("nowhere:Env"), env_timeout_s=10)
 
 
+@pytest.mark.slow
 def test_the_tools_own_process_loads_neither_learner_nor_simulator(in_root):
     code = (
         "import sys; from rlctl.checking.check import check; import rlctl.checking.formats; "
@@ -176,6 +179,7 @@ def test_command_of_a_clean_environment(tmp_path):
     assert "\x1b" not in run.stdout
 
 
+# Takes seconds, and runs in every `make test`: all rules by the command, and its exit code.
 def test_command_of_a_broken_environment(tmp_path):
     file = tmp_path / "report.json"
     chosen = ["--select", "RL1,RL901"]

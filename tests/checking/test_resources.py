@@ -14,7 +14,7 @@ from tests.checking.judging import case, check_case, findings, mark_slow, record
 
 FILE = "broken_resources.py"
 CASES = [
-    case(f"{FILE}:RL405LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld", pybullet=True),
+    case(f"{FILE}:RL405LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld", pybullet=True, slow=True),
     case(f"{FILE}:RL405KeepsFiles", ("RL405", "warning")),
     case(f"{FILE}:RL405KeepsThreads", ("RL405", "warning")),
     case(f"{FILE}:RL405KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:RL405Caches"),
@@ -33,6 +33,7 @@ def the_finding(name, rule):
     return finding
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_each_reset_leaves_a_client(monkeypatch):
     monkeypatch.setattr(leaks, "MOST_RESETS", 12)  # each is slow: PyBullet connects anew
@@ -44,6 +45,7 @@ def test_each_reset_leaves_a_client(monkeypatch):
     assert judge(records_of(f"{FILE}:ReconnectsProperly", "build", "leaks"), ["RL405"]).findings == []
 
 
+@pytest.mark.slow
 def test_memory_is_counted():
     finding = the_finding("RL405KeepsMemory", "RL405")
     # 50,000 numbers of 8 bytes.

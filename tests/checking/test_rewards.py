@@ -20,28 +20,33 @@ def broken(name, *expected, twin=None, **settings):
 
 
 CASES = [
-    broken("RL602ConstantReward", ("RL602", "warning")),
-    broken("RL602SparseNeverFound", ("RL602", "info"), ("RL611", "info")),
-    broken("RL603LargeReward", ("RL603", "warning"), twin="RL603FinalBonus"),
+    broken("RL602ConstantReward", ("RL602", "warning"), slow=True),
+    broken("RL602SparseNeverFound", ("RL602", "info"), ("RL611", "info"), slow=True),
+    broken("RL603LargeReward", ("RL603", "warning"), twin="RL603FinalBonus", slow=True),
     broken("RL603LargeTerm", ("RL603", "warning"), twin="RL603FinalBonus", slow=True),
-    broken("RL603HugeOnce", ("RL603", "warning"), twin="RL603FinalBonus"),
-    broken("RL604Falls", ("RL604", "warning"), twin="RL604FallsBadly"),
-    broken("RL604FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="RL604FallsBadly"),
+    broken("RL603HugeOnce", ("RL603", "warning"), twin="RL603FinalBonus", slow=True),
+    broken("RL604Falls", ("RL604", "warning"), twin="RL604FallsBadly", slow=True),
+    broken("RL604FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="RL604FallsBadly", slow=True),
     broken("RL605Hovering", ("RL605", "warning"), twin="RL605FinishingPays"),
     broken("RL605HoveringUntold", ("RL605", "warning"), ("RL609", "info"), twin="RL605PaysProgress"),
-    broken("RL606AliveBonus", ("RL606", "warning"), twin="RL606Paid"),
-    broken("RL606AliveUntold", ("RL606", "info"), twin="RL606Paid"),
+    broken("RL606AliveBonus", ("RL606", "warning"), twin="RL606Paid", slow=True),
+    broken("RL606AliveUntold", ("RL606", "info"), twin="RL606Paid", slow=True),
     broken("RL609SuccessUntold", ("RL609", "info"), twin="RL609SuccessArray"),
     broken("RL609SuccessMisnamed", ("RL609", "info"), twin="RL609SuccessOtherwiseNamed"),
     broken("RL609SuccessIsAShare", ("RL609", "info")),
     broken("RL610SuccessAtStart", ("RL610", "warning"), twin="RL610SuccessOnAverage"),
     broken("RL611SuccessNever", ("RL611", "info")),
     broken("RL612WrongSlice", ("RL612", "warning"), twin="RL612TimePenalty", slow=True),
-    broken("RL620ActionWithItself", ("RL620", "info"), twin="RL620Smooth"),
-    broken("RL621EffortPays", ("RL621", "warning"), twin="Terms"),
-    broken("RL621CalledPenalty", ("RL621", "info"), twin="RL621LowersTheReward"),
-    case("broken_models.py:RL620CartComparesWithItself", ("RL620", "warning"), twin="broken_models.py:RL620CartSmooth"),
-    case("broken_models.py:RL621CartSignTwice", ("RL621", "warning"), twin="broken_models.py:CartTask"),
+    broken("RL620ActionWithItself", ("RL620", "info"), twin="RL620Smooth", slow=True),
+    broken("RL621EffortPays", ("RL621", "warning"), twin="Terms", slow=True),
+    broken("RL621CalledPenalty", ("RL621", "info"), twin="RL621LowersTheReward", slow=True),
+    case(
+        "broken_models.py:RL620CartComparesWithItself",
+        ("RL620", "warning"),
+        twin="broken_models.py:RL620CartSmooth",
+        slow=True,
+    ),
+    case("broken_models.py:RL621CartSignTwice", ("RL621", "warning"), twin="broken_models.py:CartTask", slow=True),
 ]
 
 
@@ -65,6 +70,7 @@ def test_clean_is_clean(task):
     assert found(task, *rules_of("RL6")) == set()
 
 
+@pytest.mark.slow
 def test_goal_that_ends_the_episode_is_no_failure():
     assert found(f"{BROKEN}:EndsAtUntoldGoal", *rules_of("RL6")) == {("RL609", "info")}
 

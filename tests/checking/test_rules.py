@@ -27,7 +27,7 @@ CASES = [
     case("broken_envs.py:RL101WrongShape", ("RL101", "error")),
     case("broken_envs.py:RL101MissingKey", ("RL101", "error")),
     case("broken_envs.py:RL102Float64", ("RL102", "warning")),
-    case("broken_envs.py:RL103OutOfRange", ("RL103", "warning")),
+    case("broken_envs.py:RL103OutOfRange", ("RL103", "warning"), slow=True),
     case("broken_envs.py:RL103OutOfRangeAtReset", ("RL103", "error")),
     case("broken_envs.py:RL103OftenOutOfRange", ("RL103", "error")),
     case("broken_envs.py:RL103LastOutOfRange", ("RL103", "info")),
@@ -118,6 +118,7 @@ OTHERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "task",
     ["FrozenLake-v1", *(pytest.param(task, marks=pytest.mark.slow) for task in OTHERS)],
@@ -179,6 +180,7 @@ def test_difference_is_named():
     assert finding.evidence["relative_difference"] > 1e-3
 
 
+@pytest.mark.slow
 def test_state_that_reset_keeps_is_named():
     (finding,) = findings("broken_repeats.py:OldActions", "RL301")
     assert finding.message.endswith("; a new process repeats it, so reset keeps state (self.actions, self.position)")
@@ -202,6 +204,7 @@ def test_what_a_nearer_rule_explains_is_not_judged():
     assert not {"RL303", "RL304", "RL305", "RL401", "RL402"} & set(verdict.judged)
 
 
+@pytest.mark.slow
 def test_space_that_no_rule_can_look_into_is_said():
     verdict = verdict_of("broken_spaces.py:RL109TextObservation", "RL101", "RL102", "RL103", "RL104")
     assert verdict.findings == []

@@ -48,6 +48,7 @@ def play(task, experiments, seconds, most_growth):
     return records
 
 
+@pytest.mark.slow
 def test_the_time_of_a_slow_environment_grows_while_it_is_played(slow):
     seconds = 0.15  # the comparisons take some 500 steps, which are 0.25 s
     assert play(slow, ["comparisons"], seconds, 1.0).finished["comparisons"].is_cut

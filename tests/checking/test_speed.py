@@ -16,7 +16,7 @@ from rlctl.checking.speed import Speed, format_speed
 from tests.checking.judging import case, check_case, mark_slow, shared_records_of
 
 CASES = [
-    case("broken_speed.py:RL901SlowStep", ("RL901", "warning")),
+    case("broken_speed.py:RL901SlowStep", ("RL901", "warning"), slow=True),
     case("broken_speed.py:RL903Sleeps", ("RL903", "warning")),
     case("broken_speed.py:RL903Renders", ("RL903", "warning"), twin="broken_speed.py:RL903Sees"),
     case("broken_speed.py:RL904ReadsFile", ("RL904", "warning")),

@@ -8,14 +8,21 @@ ERROR = "error"
 SOUND = "broken_variants.py:Sound"
 CASES = [
     case("broken_variants.py:RL011WrongBody", ("RL011", ERROR), twin=SOUND, slow=True),
-    case("broken_variants.py:RL011OwnChance", ("RL011", ERROR), twin=SOUND),
-    case("broken_variants.py:RL011BreaksDown", ("RL011", ERROR), twin="broken_variants.py:RL011NeedsItsEvents"),
-    case("broken_variants.py:RL014ForgetsTheMass", ("RL014", "warning"), twin="broken_variants.py:RL014AppliesTheMass"),
+    case("broken_variants.py:RL011OwnChance", ("RL011", ERROR), twin=SOUND, slow=True),
+    case(
+        "broken_variants.py:RL011BreaksDown", ("RL011", ERROR), twin="broken_variants.py:RL011NeedsItsEvents", slow=True
+    ),
+    case(
+        "broken_variants.py:RL014ForgetsTheMass",
+        ("RL014", "warning"),
+        twin="broken_variants.py:RL014AppliesTheMass",
+        slow=True,
+    ),
     case("broken_variants.py:RL013Misspelled", ("RL013", "warning"), twin=SOUND),
-    case("broken_variants.py:RL012WrongKey", ("RL012", ERROR), twin=SOUND),
-    case("broken_variants.py:RL012WrongParameter", ("RL012", ERROR), twin=SOUND),
-    case("broken_variants.py:RL012WrongEvent", ("RL012", ERROR), twin=SOUND),
-    case("broken_variants.py:RL012OtherSpaces", ("RL012", ERROR), twin=SOUND),
+    case("broken_variants.py:RL012WrongKey", ("RL012", ERROR), twin=SOUND, slow=True),
+    case("broken_variants.py:RL012WrongParameter", ("RL012", ERROR), twin=SOUND, slow=True),
+    case("broken_variants.py:RL012WrongEvent", ("RL012", ERROR), twin=SOUND, slow=True),
+    case("broken_variants.py:RL012OtherSpaces", ("RL012", ERROR), twin=SOUND, slow=True),
 ]
 
 
@@ -61,6 +68,7 @@ def test_a_base_class_in_another_module_may_use_a_name():
     assert findings("rlctl_locomotion.humanoid_walk:HumanoidWalk", "RL013") == []
 
 
+@pytest.mark.slow
 def test_a_task_that_randomises_is_judged_so(rlctl):
     task = f"{FOLDER}/broken_variants.py:RL011BreaksDown"
     done = rlctl("check-env", task, "--select", "RL011,RL301", "--set", "randomize=true")
@@ -73,6 +81,7 @@ def test_an_error_of_the_task_layer_is_named_as_one():
     assert finding.message == "step 1 raised TaskError: NotFinite: reward term 'distance' is nan at step 1"
 
 
+@pytest.mark.slow
 def test_stages_of_a_packaged_recipe_are_judged(tmp_path, write_module):
     task = write_module("swing.py", "from rlctl_manipulation.reach import Reach\nclass Swing(Reach): pass\n")
     task.with_suffix(".yaml").write_text("stages: [{task: {episode: 1}, promote: {success: 0.5}}, {}]\n")

@@ -169,6 +169,7 @@ def test_underscores_are_read_as_dashes(rlctl):
     assert rlctl("check_env", "reech").returncode == 2
 
 
+@pytest.mark.slow
 def test_a_plugins_traceback_stands_above_the_error(installed_rlctl, write_module):
     write_module("broken.py", "raise RuntimeError('no robot')")
     *above, last = installed_rlctl("train", "broken.py:Env").stderr.splitlines()
@@ -284,6 +285,7 @@ def test_a_bug_shows_its_traceback(rlctl, tmp_path):
     assert result.stderr.splitlines()[-1].startswith(f"error: a bug in rlctl {package.__version__} or a library; ")
 
 
+@pytest.mark.slow
 def test_an_exit_handler_that_hangs_does_not_keep_the_process(tmp_path):
     code = (
         "import atexit, sys, time; from rlctl import cli; from rlctl.processes import error_boundary\n"

@@ -91,6 +91,7 @@ def test_a_broken_command_is_explained_in_a_line(rlctl, site, name, message):
     assert "rlctl/cli" not in result.stderr
 
 
+@pytest.mark.slow
 def test_the_names_of_rlctl_stay_its_own(rlctl, site):
     assert "my_robot" not in rlctl("train", "--help", path=site).stdout
     assert "--max-clients" in rlctl("serve", "--help", path=site).stdout
@@ -105,6 +106,7 @@ def test_the_names_of_rlctl_stay_its_own(rlctl, site):
     ]
 
 
+@pytest.mark.slow
 def test_the_check_imports_each(site, monkeypatch):
     monkeypatch.syspath_prepend(site)
     monkeypatch.setenv("PYTHONPATH", str(site))

@@ -23,6 +23,7 @@ def rlctl(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sim", "engine"), [((), "PyBullet"), pytest.param(("--sim", "mujoco"), "MuJoCo", marks=pytest.mark.slow)]
 )
@@ -69,6 +70,7 @@ VERBS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["check-env", pytest.param("eval", marks=pytest.mark.slow)])
 def test_an_engine_that_does_not_exist(rlctl, verb):
     done = rlctl(verb, "reach", "--sim", "mujocoo")

@@ -245,6 +245,7 @@ def test_a_cluster_that_is_gone(cluster, tmp_path):
     wait_for(lambda: has_ended(pid), 30)
 
 
+@pytest.mark.slow
 def test_a_cluster_that_is_not_there(rlctl):
     """In a process of its own: one that is connected to another cluster keeps its connection."""
     done = rlctl("train", LINE, "--seeds", "0-1", "--on", "ray:127.0.0.1:1", "--no-check")

@@ -16,6 +16,7 @@ def errors(part, operations, each=3):
     return tried[part :: each * PARTS]
 
 
+# Takes seconds, and runs in every `make test`: a full disk leaves whole files.
 @parts(3)
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_error_once_costs_nothing(trials, whole, folders, name, part):

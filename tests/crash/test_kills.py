@@ -14,6 +14,7 @@ def every(part, operations):
     return range(part or PARTS, operations + 2, PARTS)
 
 
+# Takes seconds, and runs in every `make test`: a power failure leaves files that go on.
 @parts
 @pytest.mark.parametrize(
     ("name", "fault"),

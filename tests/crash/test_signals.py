@@ -20,16 +20,11 @@ CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 BEFORE = ("workers start", "workers build", "run folder")
 AFTER = ("last checkpoint", "done")
 CASES = [(phase, number) for phase in PHASES for number in CODES]
-QUICK = ("checkpoint", signal.SIGINT)
-"""The one that is not only for `make test-crash`."""
 
 
-@pytest.mark.parametrize(
-    ("phase", "number"), [case if case == QUICK else pytest.param(*case, marks=pytest.mark.crash) for case in CASES]
-)
-@pytest.mark.parametrize(
-    "everybody", [pytest.param(False, id="alone"), pytest.param(True, id="everybody", marks=pytest.mark.crash)]
-)
+@pytest.mark.crash  # a quick one is in tests/training/test_interruption.py
+@pytest.mark.parametrize(("phase", "number"), CASES)
+@pytest.mark.parametrize("everybody", [pytest.param(False, id="alone"), pytest.param(True, id="everybody")])
 def test_a_signal_in_a_phase(trials, whole, tmp_path, phase, number, everybody):
     before = whole("ppo")
     ended = trials.run(

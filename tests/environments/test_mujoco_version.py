@@ -33,6 +33,7 @@ def raise_in(tmp_path, monkeypatch):
     return raise_there
 
 
+@pytest.mark.slow
 def test_of_an_installed_package_both_versions_are_named(raise_in, monkeypatch):
     version = mujoco.__version__
     expected = f"old-robots 1.3 (it asks for mujoco<3.9,>=2.2) may be written for another MuJoCo than {version}: "

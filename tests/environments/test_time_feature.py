@@ -100,6 +100,7 @@ def zoo_agent(tmp_path_factory):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_zoos_agents_play_as_they_did(zoo_agent):
     model, env, imported = zoo_agent

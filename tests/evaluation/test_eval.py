@@ -52,6 +52,7 @@ def test_success_interval_by_hand():
     assert success_interval(results[:8]) == (pytest.approx(0.025 ** (1 / 8)), 1.0)
 
 
+@pytest.mark.slow_except("0.9")
 @pytest.mark.parametrize("rate", [0.5, 0.9, 0.995])
 def test_success_interval_covers_at_least_as_often_as_it_says(rate):
     episodes = 100
@@ -82,6 +83,7 @@ def test_mean_terms_add_up():
     assert mean_terms(results) == {"a": 3.0, "b": 1.0}
 
 
+@pytest.mark.slow
 def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation):
     alone = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, n_envs=1))
     assert [episode.result.total_reward for episode in alone.played] == [
@@ -116,6 +118,7 @@ def test_tolerance_is_a_parameter(reach_run):
     assert run_evaluation(wide).success_rate == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
     shaken = run_evaluation(EvalRequest(str(reach_run.path), episodes=6, changes=EnvChanges(randomize=True)))
@@ -134,6 +137,7 @@ def test_it_says_whether_it_was_randomised(reach_run, evaluation, rlctl):
     assert f"2 episodes, seed 0, PyBullet, randomised by {', '.join(offered)}" in randomised.stdout
 
 
+@pytest.mark.slow
 def test_stochastic_repeats_with_its_seed(reach_run):
     request = EvalRequest(str(reach_run.path), episodes=2, deterministic=False)
     first, second = (run_evaluation(request).returns.mean for _ in range(2))
@@ -177,6 +181,7 @@ def test_a_return_to_reach_is_a_number():
         Gates(min_return=math.nan)
 
 
+@pytest.mark.slow
 def test_a_gate_on_success_needs_success(tmp_path):
     run = run_training(TrainRequest(f"{ENVS}:NoSuccess", settings=SMALL_PPO, root=tmp_path, check=False)).run
     with pytest.raises(UsageError, match="--min-success: this task reports no success"):
@@ -259,6 +264,7 @@ def test_junit_has_the_seeds_of_a_group_and_an_error_for_one_without_a_score():
     assert (case.classname, case.name, case.outcomes[0].tag) == ("reach.eval", "seed 0", "error")
 
 
+@pytest.mark.slow
 def test_a_missed_gate_and_an_error_are_in_the_junit_file(reach_run, rlctl, tmp_path):
     done = rlctl("eval", reach_run.path, "--episodes", 2, "--min-return", 1e9, "--junit", "eval.xml")
     assert done.returncode == 1

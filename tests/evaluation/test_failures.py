@@ -46,6 +46,7 @@ def test_a_pattern_is_one_line():
     assert str(pattern).startswith("23 of 34 with friction <= 0.524 fail, 0 of 66 others (p = ")
 
 
+@pytest.mark.slow
 def test_failures_by_chance_have_nothing_in_common(monkeypatch):
     monkeypatch.setattr(failures, "_RELABELLED", 200)  # the smallest p-value is 0.005
     found = [bool(find_patterns(play(seed, lambda luck, *_: luck < 0.2), INFO)) for seed in range(60)]

@@ -20,6 +20,7 @@ def push(run, **request):
     return measure_robustness(EvalRequest(str(run.path), episodes=4, **request), push=True).push
 
 
+@pytest.mark.slow
 def test_the_threshold_by_hand_and_beside_a_map(block_run):
     request = EvalRequest(str(block_run.path), episodes=4)
     vary = measure_robustness(request, ["mass=1:2:2"])
@@ -37,12 +38,14 @@ def test_the_threshold_by_hand_and_beside_a_map(block_run):
     assert kept.maps == vary.maps
 
 
+@pytest.mark.slow
 def test_without_success_an_early_end_is_a_fall(tmp_path):
     found = push(write_run(tmp_path / "run", f"{ENVS}:Lost"))
     assert found.measure == "upright"
     assert 0.1 < found.threshold < 0.15
 
 
+@pytest.mark.slow
 def test_cannot_tell(block_run, tmp_path):
     from rlctl.environments.spec import EnvChanges
 

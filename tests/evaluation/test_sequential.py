@@ -21,6 +21,7 @@ def test_under_the_null_few_gates_are_decided(rate):
     assert 0 < decided.mean() <= ALPHA
 
 
+@pytest.mark.slow_except("0.88-0.9")
 @pytest.mark.parametrize(("true", "rate"), [(0.5, 0.5), (0.88, 0.9)])
 def test_under_the_null_the_lower_end_seldom_passes(true, rate):
     """1,000 evaluations of 200 episodes: fewer than 5 % pass by the lower end, but many more by the measured rate."""
@@ -71,6 +72,7 @@ def test_the_interval_contains_the_rate(successes, episodes):
     assert math.isfinite(low + high)
 
 
+@pytest.mark.slow
 def test_clear_answers_end_early(rlctl):
     """`zero` never reaches a goal: (1 / 3) / 0.1^2 = 33 > 20 after two failures."""
     done = rlctl("eval", "reach", "--policy", "zero", "--min-success", "0.9", "--decide-early", "--json", "-")

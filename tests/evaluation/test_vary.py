@@ -73,6 +73,7 @@ def test_it_is_kept_with_the_run(measured):
         read(file)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_parameters_of_the_task_are_varied_too(block_run):
     request = EvalRequest(str(block_run.path), episodes=3)
@@ -84,6 +85,7 @@ def test_parameters_of_the_task_are_varied_too(block_run):
     assert read(block_run.robustness_file).maps == result.maps
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_command_line_draws_the_map_and_gates_the_worst_cell(rlctl, block_run):
     arguments = ("eval", block_run.path, "--episodes", 3, "--vary", "push=0:6:2", "--vary", "mass=1:2:2")
@@ -132,6 +134,7 @@ def test_the_command_for_one_cell_is_the_whole_of_it(measured):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize("vary", [["push=0:3:2", "mass=1:3:2"], ["sim=0.01:0.02:2"]], ids=["events", "sim"])
 def test_the_command_for_one_cell_plays_it_and_leaves_the_measurement(vary, rlctl, tmp_path):
@@ -171,6 +174,7 @@ def test_the_command_names_what_the_measurement_changed(measured):
     assert measured.sim == Engine()  # the policy's own
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_command_line_as_json(rlctl, block_run):
     done = rlctl("eval", block_run.path, "--episodes", 2, "--vary", "friction=0.2:1:2", "--json", "-")
@@ -299,6 +303,7 @@ def test_events_set_in_a_standing_world_act_as_in_a_new_one():
         fresh.close()
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_contacts_from_soft_to_stiff(rlctl):
     pytest.importorskip("mujoco")

@@ -121,6 +121,7 @@ def play(policy, controllers, env):
     return worst
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     ("history", "start"), [({}, "first"), ({"angles": 3, "int": 2, "last": 2}, "first"), ({"gravity": 2}, "zeros")]
@@ -142,6 +143,7 @@ def test_terms_and_histories(history, start, tmp_path):
     assert in_c.may_send
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_stack_of_frames_and_an_lstm(small, train, write, tmp_path):
     spec = dataclasses.replace(small("vector", "box"), frame_stack=2)
@@ -170,6 +172,7 @@ def commanding(**command):
     return make_policy(make_env(joints=joints))
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(
     ("command", "expected"),
@@ -202,6 +205,7 @@ def test_targets_by_hand(command, expected, tmp_path):
     )
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_targets_follow_a_clip_and_stop_with_the_robot(tmp_path):
     policy = commanding(action_correction=[0.1, 0.2], reference="clip")
@@ -228,6 +232,7 @@ def test_targets_follow_a_clip_and_stop_with_the_robot(tmp_path):
     assert "clip (3 rows of a clip, at the time of the episode)" in source.write().header
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_time_in_a_clip_may_be_an_input(tmp_path):
     env = make_env(joints=dataclasses.replace(JOINTS, action_correction=0.1, reference="timed_joints"))
@@ -250,6 +255,7 @@ def source_names(source):
     return [quantity.name for quantity in source.plan.quantities]
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_what_leaves_is_finite_and_the_last_target_is_repeated(tmp_path):
     policy = commanding(action_step=[0.1, 0.2], measured="angles")
@@ -278,6 +284,7 @@ def test_what_leaves_is_finite_and_the_last_target_is_repeated(tmp_path):
     assert controller.status == ("running", "")
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_last_action_is_the_limited_one(tmp_path):
     env = EnvInfo(

@@ -44,6 +44,7 @@ def policy_of(tmp_path):
     return write
 
 
+@pytest.mark.slow
 def test_both_files_are_verified_within_limits(policy_of, tmp_path):
     limits = tmp_path / "limits.yaml"
     limits.write_text(LIMITS)

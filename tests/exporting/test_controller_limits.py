@@ -156,6 +156,8 @@ def is_same_reason(reason, text):
     return reason in text if reason else text == ""
 
 
+# Takes seconds, and runs in every `make test`: limits in C.
+@pytest.mark.slow_except("action")
 @pytest.mark.parametrize("case", CASES)
 def test_limits_in_c_are_those_in_python(case, tmp_path):
     seen = compare(*CASES[case], 6_700, 1, tmp_path)
@@ -165,6 +167,7 @@ def test_limits_in_c_are_those_in_python(case, tmp_path):
     assert min(seen[reason] for reason in faults) >= 5
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")
 @pytest.mark.parametrize("case", ["position", "step"])
 def test_the_file_compiles_as_c_plus_plus(case, tmp_path):
@@ -187,6 +190,7 @@ def test_a_million_steps(case, tmp_path):
     assert sum(seen[state] for state in STATUS) == STEPS // len(CASES | MORE_CASES) + 1
 
 
+@pytest.mark.slow
 def test_default_ranges_of_orientations_and_commands(tmp_path):
     env = make_arm(
         observation_terms={"goal": terms.Gravity("orientation")},

@@ -114,6 +114,7 @@ def test_without_the_extra(datasets, run, monkeypatch, tmp_path, name, package):
         export_dataset(ExportRequest(str(run.path), dataset=name, output=tmp_path / "new"))
 
 
+@pytest.mark.slow
 def test_the_command(rlctl, run):
     done = rlctl("export", run.path, "--dataset", "lerobot", "--episodes", "2", "-o", "data")
     assert done.stdout == "wrote data: lerobot, 2 episodes, 2 succeeded, 20 steps\n"

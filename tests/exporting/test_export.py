@@ -37,6 +37,8 @@ def assert_verified(report):
     assert loop.max_return_difference <= 1e-3
 
 
+# Takes seconds, and runs in every `make test`: an export acts as its policy.
+@pytest.mark.slow_except("ppo-dict-box")
 @pytest.mark.parametrize(
     ("algo", "observation", "action"),
     [
@@ -76,12 +78,14 @@ def test_export_of_known_tasks(algo, task, train, write):
     assert report.latency.speedup > 0  # 9 to 15 on an idle machine
 
 
+@pytest.mark.slow
 def test_more_rollouts_where_episodes_are_short(small, train, write):
     report = export(write(train("ppo", small(), steps=0), "ppo", small()))
     # 20 episodes of 20 steps are not enough; so many more are played that 1,000 observations are reached.
     assert 1000 <= report.agreement.observations <= 1200
 
 
+@pytest.mark.slow
 def test_run_gets_it_into_its_exports(small, train, write, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     policies = tmp_path / "runs" / "reach" / "2026-11-21_10-30-00_s0" / "policies"
@@ -125,6 +129,7 @@ def test_not_verified_is_not_kept(small, train, write, tmp_path):
     assert target.read_bytes() == b"former"
 
 
+@pytest.mark.slow
 def test_an_environment_that_magnifies_rounding_is_verified_by_its_actions(small, train, write):
     spec = small(factor=100.0)
     report = export(write(train("ppo", spec, steps=0), "ppo", spec))
@@ -153,12 +158,14 @@ def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions
     assert report.as_json()["closed_loop"]["repeats"] is False
 
 
+@pytest.mark.slow
 def test_other_actions_are_noticed_where_episodes_do_not_repeat(small, train, write):
     path = write_policy_of_rounding_errors(train, write, small(noise=0.1))
     with pytest.raises(AnswerIsNo, match="it does not act as"):
         export(path)
 
 
+@pytest.mark.slow
 def test_other_weights_are_noticed(small, train, write, tmp_path):
     model = train("ppo", small())
     original = write(model, "ppo", small())
@@ -267,6 +274,7 @@ def test_onnx_file_is_not_exported_again(tmp_path):
         export(tmp_path / "policy.onnx")
 
 
+@pytest.mark.slow
 def test_command_line(rlctl, small, train, write, tmp_path):
     spec = small()
     path = write(train("ppo", spec), "ppo", spec)
@@ -288,6 +296,7 @@ def test_command_line(rlctl, small, train, write, tmp_path):
     assert result["inputs"] == [{"name": "obs", "dtype": "float", "shape": ["batch", 3]}]
 
 
+@pytest.mark.slow
 def test_command_line_when_the_answer_is_no(rlctl, small, train, write, tmp_path):
     path = write_policy_of_rounding_errors(train, write, small())
     done = rlctl("export", path.name, "--onnx", cwd=tmp_path)
@@ -297,6 +306,7 @@ def test_command_line_when_the_answer_is_no(rlctl, small, train, write, tmp_path
     assert not path.with_suffix(".onnx").exists()
 
 
+@pytest.mark.slow
 def test_report_as_json_file(small, train, write, tmp_path):
     spec = small()
     report = export(write(train("ppo", spec, steps=0), "ppo", spec))

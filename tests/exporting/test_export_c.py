@@ -88,6 +88,9 @@ SLOW_CASES = [
 ]
 
 
+@pytest.mark.slow_except(
+    "ppo-vector-box-settings0", "dqn-vector-discrete-settings7", "recurrent_ppo-vector-box-settings8"
+)
 @needs_compiler
 @pytest.mark.parametrize(
     ("algo", "observation", "action", "settings"),
@@ -108,6 +111,7 @@ def test_hard_normalisation(small, train, write, compiled, odd_statistics):
     assert difference(path, compiled(path)) <= 1e-5
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize(("algo", "frames"), [("ppo", 3), pytest.param("recurrent_ppo", 1, marks=pytest.mark.slow)])
 def test_export_is_verified(algo, frames, small, train, write, tmp_path):
@@ -129,6 +133,7 @@ def test_export_is_verified(algo, frames, small, train, write, tmp_path):
     assert ("frames[9]" in header) == (frames == 3)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_an_environment_that_does_not_repeat_its_episodes_is_verified_by_actions(small, train, write):
     spec = small(keeps=True)
@@ -194,6 +199,7 @@ def read_numbers(library, name, count, kind=ctypes.c_float):
     return list((kind * count).in_dll(ctypes.CDLL(str(library)), name))
 
 
+@pytest.mark.slow_except("1")
 @needs_compiler
 @pytest.mark.parametrize("frames", [1, 3])
 def test_names_bounds_and_units_are_data(frames, small, train, write, tmp_path):

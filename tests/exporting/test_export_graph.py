@@ -62,6 +62,7 @@ def action_for(algo):
     return "discrete" if algo == "dqn" else "box"
 
 
+@pytest.mark.slow_except("ppo", "dqn", "recurrent_ppo", "sac")
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_algorithm_acts_as_in_sb3_with_hard_normalisation(algo, small, train, write, odd_statistics):
     spec = small(action=action_for(algo))
@@ -97,6 +98,7 @@ def test_every_kind_of_action(action, small, train, write):
     assert difference(model, write(model, "ppo", spec), random_observations(model.observation_space)) <= 1e-5
 
 
+@pytest.mark.slow_except("matrix")
 @pytest.mark.parametrize("action", ["matrix", "double"])
 def test_squashed_actions_of_other_shapes_and_types(action, small, train, write):
     spec = small(action=action)
@@ -111,6 +113,7 @@ def test_every_activation(name, small, train, write):
     assert difference(model, write(model, "ppo", spec), random_observations(model.observation_space)) <= 1e-6
 
 
+@pytest.mark.slow_except("ppo-policy_kwargs1")
 @pytest.mark.parametrize(
     ("algo", "policy_kwargs"), [("ppo", {}), ("ppo", {"squash_output": True}), ("a2c", {}), ("sac", {}), ("crossq", {})]
 )
@@ -120,6 +123,7 @@ def test_state_dependent_exploration_acts_without_its_noise(algo, policy_kwargs,
     assert difference(model, write(model, algo, spec), random_observations(model.observation_space)) <= 1e-6
 
 
+@pytest.mark.slow_except("policy_kwargs2")
 @pytest.mark.parametrize(
     "policy_kwargs",
     [

@@ -49,6 +49,7 @@ def test_values_and_their_inverse(mapping):
     assert maps["goal"].describe() == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["onnx", "c"])
 def test_a_controller_maps_its_inputs(policy, mapping, tmp_path, form):
     if form == "onnx":
@@ -155,6 +156,7 @@ def test_exports_have_the_gains_of_servos_in_their_own_unit(legs):
     assert "drive_gain" not in make_metadata(legs.info)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_targets_and_units_in_c(legs, tmp_path):
     mapping = read(legs, tmp_path, TARGETS.replace("TARGET", LIKE))

@@ -144,6 +144,7 @@ def test_addresses_without_a_run():
     assert not store.is_address("ws://127.0.0.1:8000")
 
 
+@pytest.mark.slow
 def test_an_s3_server(run, monkeypatch):
     from moto.server import ThreadedMotoServer
 

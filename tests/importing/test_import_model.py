@@ -32,16 +32,18 @@ OFF_POLICY = {"learning_starts": 8, "buffer_size": 100, "batch_size": 8}
 TINY = {"policy_kwargs": {"net_arch": [8]}}
 CASES = [
     ("ppo", "vector", "box", {}),
+    ("a2c", "vector", "discrete", {}),
+    ("dqn", "vector", "discrete", TINY),
+    ("recurrent_ppo", "vector", "box", {"policy_kwargs": {"lstm_hidden_size": 8}}),
+]
+SLOW_CASES = [
     ("ppo", "vector", "box", {"use_sde": True, "policy_kwargs": {"activation_fn": torch.nn.ReLU, "net_arch": [8]}}),
     ("ppo", "dict", "discrete", {"learning_rate": lambda left: 1e-3 * left}),
-    ("a2c", "vector", "discrete", {}),
     ("sac", "vector", "box", {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [16]}}}),
     ("td3", "vector", "box", TINY),
     ("ddpg", "vector", "box", TINY),
-    ("dqn", "vector", "discrete", TINY),
     ("tqc", "vector", "box", {"policy_kwargs": {"n_quantiles": 5, "n_critics": 3, "net_arch": [8]}}),
     ("crossq", "vector", "box", TINY),
-    ("recurrent_ppo", "vector", "box", {"policy_kwargs": {"lstm_hidden_size": 8}}),
 ]
 
 
@@ -71,7 +73,11 @@ def save(tmp_path):
     return saved
 
 
-@pytest.mark.parametrize(("algo", "observation", "action", "kwargs"), CASES, ids=lambda value: str(value)[:30])
+@pytest.mark.parametrize(
+    ("algo", "observation", "action", "kwargs"),
+    [*CASES, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW_CASES)],
+    ids=lambda value: str(value)[:30],
+)
 def test_acts_as_the_model_does(save, algo, observation, action, kwargs):
     model, env, request = save(algo, observation, action, **kwargs)
     imported = import_model(**request)
@@ -153,6 +159,7 @@ def test_a_call_that_is_not_on_the_list_is_refused_and_not_made(save, tmp_path):
     assert not proof.exists()
 
 
+@pytest.mark.slow
 def test_a_device_is_not_needed(save):
     _, _, request = save("sac")
     original = import_model(**request)
@@ -234,6 +241,7 @@ def test_a_stack_of_frames_is_named_as_such(tmp_path):
         import_model(tmp_path / "model.zip", "Pendulum-v1")
 
 
+@pytest.mark.slow
 def test_other_spaces_are_refused(save):
     _, _, request = save()
     with pytest.raises(ArtifactError, match=r"model.zip: it observes Box\(3,\), reach returns Box"):

@@ -59,6 +59,7 @@ def group(tmp_path_factory):
     return result.score.group
 
 
+@pytest.mark.slow
 def test_each_seed_is_an_ordinary_run(group):
     assert group.path.name.endswith("_seeds")
     for seed in (4, 5):
@@ -102,6 +103,7 @@ def test_the_newest_thing_trained_is_the_group(group, monkeypatch, tmp_path):
     assert [run.path for run in find_runs_of(str(one))] == [one]
 
 
+@pytest.mark.slow
 def test_resume_latest_goes_on_with_the_group(group, rlctl):
     """One run was stopped before its first checkpoint: both are in the table at the end."""
     root = group.path.parent.parent

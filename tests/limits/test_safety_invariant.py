@@ -231,6 +231,7 @@ def attack(options, space, dt, steps):
     return safety
 
 
+@pytest.mark.slow
 @settings(REPEATABLE, max_examples=60)
 @given(choose_limits(), SPACES, DTS, STEPS)
 def test_the_output_keeps_every_limit(options, space, dt, steps):

@@ -162,6 +162,7 @@ def test_rough_ground_does_not_end_before_the_episode():
     assert env.task.ground.terrain[..., 0].max() > 2 * env.task.top_speed * env.task.episode_s
 
 
+@pytest.mark.slow
 def test_rough_ground_is_walked_on():
     env = TaskEnv(Biped3D(roughness=0.05, terrain_seed=3))
     env.reset(seed=0)

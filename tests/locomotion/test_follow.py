@@ -19,6 +19,7 @@ TASKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_clips_are_those_of_the_keyframes(name):
     _, cls, make = TASKS[name]

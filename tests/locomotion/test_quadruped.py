@@ -91,6 +91,7 @@ def rows(env, seed, steps=120):
     return np.array(observations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [pytest.param(0.0, marks=pytest.mark.slow), 0.04])
 def test_episodes_repeat_with_contacts_pushes_and_all_randomisation(roughness):
     def make():

@@ -51,6 +51,7 @@ def test_a_block_can_be_lifted_and_held(env, seed):
     assert 9_995 < info["metrics"]["original"] < 10_000
 
 
+@pytest.mark.slow
 def test_a_miss_is_no_success(env):
     rows, info = play(env, 0, lambda task: np.array([0.0, -1.0, 0.0], np.float32))
     assert not info["is_success"]
@@ -92,6 +93,7 @@ def test_what_is_observed(env):
     seen.close()
 
 
+@pytest.mark.slow
 def test_the_hand_descends_and_stays_in_its_box(env):
     env.reset(seed=0)
     for _ in range(60):

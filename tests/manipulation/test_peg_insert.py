@@ -41,6 +41,7 @@ def insert(task):
     return np.clip(action, -1, [1, 1, 0.5, 1]).astype(np.float32)
 
 
+@pytest.mark.slow_except("1")
 @pytest.mark.pybullet
 @pytest.mark.parametrize("seed", range(4))
 def test_the_peg_can_be_inserted(env, seed):
@@ -112,6 +113,7 @@ def test_where_things_start(env):
     assert np.abs(starts).max(axis=0) == pytest.approx([0.2, 0.2, 0.01, 0.3], rel=0.1)
 
 
+@pytest.mark.slow_except("False")
 @pytest.mark.parametrize("randomize", [False, True])
 def test_episodes_repeat_bit_for_bit(randomize):
     assert_episodes_repeat(PegInsert, insert, STEPS, randomize)

@@ -32,6 +32,7 @@ def drive(task, stop=0.0004):
     return np.clip(action, -1, 1).astype(np.float32)
 
 
+@pytest.mark.slow_except("1")
 @pytest.mark.pybullet
 @pytest.mark.parametrize("seed", range(4))
 def test_the_screw_can_be_driven(env, seed):
@@ -43,6 +44,7 @@ def test_the_screw_can_be_driven(env, seed):
     assert travel == pytest.approx(turned * LEAD / (2 * math.pi), abs=2e-5)  # the thread holds
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_blocked_screw_stops_the_spindle(env):
     _, info = play(env, 0, lambda task: drive(task, stop=-1.0), STEPS)

@@ -51,6 +51,7 @@ def play(workers, segments, steps, policy=None):
     return joined, sorted(results, key=lambda pair: (pair[1].env, pair[0]))
 
 
+@pytest.mark.slow_except("2")
 @pytest.mark.parametrize("n_workers", [2, 3])
 def test_equal_however_worlds_and_steps_are_spread(spec, start, n_workers):
     one, ended = play(start(spec, 6, n_workers=1), 1, 60)
@@ -61,6 +62,7 @@ def test_equal_however_worlds_and_steps_are_spread(spec, start, n_workers):
     assert len({row for row, _ in ended}) > 4  # episodes begin at different times
 
 
+@pytest.mark.slow
 def test_workers_play_as_one_world_does(spec, start):
     workers = start(spec, 4, n_workers=1)
     played, ended = play(workers, 1, 40)
@@ -87,6 +89,7 @@ def test_workers_play_as_one_world_does(spec, start):
     assert len(results) == episode >= 1
 
 
+@pytest.mark.slow
 def test_whole_episodes_and_their_contacts(spec, start):
     seeds = list(range(7))
     one, several = start(spec, 1), start(spec, 5, n_workers=2)
@@ -104,6 +107,7 @@ def test_whole_episodes_and_their_contacts(spec, start):
         np.testing.assert_array_equal(alone.trajectory.actions, among.trajectory.actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["random", "zero"])
 def test_other_policies_play_in_every_world(spec, start, name):
     seeds, episodes = list(range(6)), []
@@ -127,6 +131,7 @@ def test_a_function_plays_and_its_failure_is_that_of_its_world(spec, start, writ
         play_episodes(workers, [1, 2, 3])
 
 
+@pytest.mark.slow
 def test_recurrent_states_are_those_of_the_environments(spec, start, recurrent):
     """The main process reads and writes them between segments."""
     one, other = start(spec, 4, n_workers=1), start(spec, 4, n_workers=2)
@@ -168,6 +173,7 @@ def recurrent():
     return make
 
 
+@pytest.mark.slow
 def test_a_value_that_is_not_finite_is_that_of_an_episode(start):
     spec = EnvSpec(STOOL, {"fault": "reward", "faulty_start": 0.285})
     workers = start(spec, 6, n_workers=2)
@@ -190,6 +196,7 @@ def test_an_action_that_is_not_finite_is_that_of_an_episode(spec, start):
         play(workers, 1, 4, linear(workers.info, WEIGHT, log_std=-1.0, bias=np.nan))
 
 
+@pytest.mark.slow
 def test_actions_are_replayed(spec, start):
     """Worlds with fewer recorded actions wait for the others."""
     first, again = start(spec, 4, n_workers=1), start(spec, 4, n_workers=2)
@@ -210,6 +217,7 @@ def test_actions_are_replayed(spec, start):
         np.testing.assert_array_equal(again.arrays.segment.stored[env, 0], played["stored"][env, count])
 
 
+@pytest.mark.slow
 def test_a_world_that_fails_when_it_is_replayed_is_left_out(start, capfd):
     workers = start(EnvSpec(STOOL, {"fault": "reward", "faulty_start": 0.2}), 3, n_workers=1)
     still = np.zeros((5, 2), np.float32)
@@ -217,6 +225,7 @@ def test_a_world_that_fails_when_it_is_replayed_is_left_out(start, capfd):
     assert left == {1}
 
 
+@pytest.mark.slow
 def test_limits_apply_in_every_world(start):
     spec, seeds, episodes = EnvSpec(STOOL), list(range(4)), []
     limits = {"joints": ["front_hip", "back_hip"], "limits": {"all": {"action": [-0.1, 0.1]}}}

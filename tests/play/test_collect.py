@@ -41,6 +41,7 @@ def expected():
     return episodes
 
 
+@pytest.mark.slow_except("3")
 @pytest.mark.parametrize("n_envs", [1, 3, 8, 16])
 def test_equal_on_any_number_of_environments(spec, start, expected, n_envs):
     episodes = play(start(spec("Walk"), n_envs), record=True)
@@ -111,6 +112,7 @@ def test_an_episode_longer_than_a_segment_is_recorded_whole(spec, start):
     assert episode.trajectory.observations[:, 0].tolist() == list(range(2346))
 
 
+@pytest.mark.slow
 def test_an_episode_that_never_ends(spec, start, monkeypatch):
     monkeypatch.setattr(collect, "MOST_STEPS", 2000)
     workers = start(spec("Long", length=0), 1)

@@ -41,6 +41,7 @@ def test_an_array_that_is_no_block_of_memory(spec, start, goals):
     )
 
 
+@pytest.mark.slow
 def test_asking_changes_nothing_of_the_episodes(spec, start, goals):
     seen = []
     for asks in (False, True):

@@ -39,6 +39,7 @@ def play(workers, segments, steps):
     return joined, sorted(results, key=lambda pair: (pair[1].env, pair[0]))
 
 
+@pytest.mark.slow_except("3")
 @pytest.mark.parametrize("n_workers", [2, 3])
 def test_equal_however_environments_and_steps_are_spread(spec, start, n_workers):
     """Five environments on two or three workers, four segments of 10 steps, against one worker and one segment."""

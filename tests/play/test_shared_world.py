@@ -59,6 +59,7 @@ def play_returns(workers):
     return [result.total_reward for result in workers.finish_playing()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Forgets", "ForgetsToStep"])
 def test_each_has_a_process(start, name):
     alone = start(EnvSpec(f"{BALLS}:Ball"), 1)

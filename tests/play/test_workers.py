@@ -37,6 +37,7 @@ def still(seed: int, steps: int):
     return seed, np.zeros((steps, 2), np.float32)
 
 
+@pytest.mark.slow
 def test_reach_does_not_depend_on_the_number_of_environments(start):
     """Environment 0 plays the same beside one and beside four others."""
     two, five = (play(start(EnvSpec("reach"), n_envs, n_workers=2), 30) for n_envs in (2, 5))
@@ -118,6 +119,7 @@ def test_without_a_listener_prints_go_to_stderr(spec, start, capfd):
     assert sorted(err.splitlines()) == ["hello from its child", "hello from the environment"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fresh_interpreters")
 def test_workers_import_no_learning_library(spec, start, tmp_path):
     module = tmp_path / "spy_env.py"
@@ -138,6 +140,7 @@ def test_workers_import_no_learning_library(spec, start, tmp_path):
     assert not loaded & {"torch", "stable_baselines3", "sb3_contrib", "rerun", "onnxruntime", "rich", "typer"}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fresh_interpreters")
 def test_nothing_is_left_open(spec):
     Workers(spec("Walk"), 1).close()
@@ -168,6 +171,7 @@ def test_a_misspelt_parameter_keeps_its_kind_of_error(spec, start):
         _ = workers.info
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fresh_interpreters")
 def test_paths_of_this_process_are_those_of_its_workers(start, tmp_path, monkeypatch):
     (tmp_path / "only_here.py").write_text("from tests.play.envs import Walk as Here\n")
@@ -177,6 +181,7 @@ def test_paths_of_this_process_are_those_of_its_workers(start, tmp_path, monkeyp
     assert workers.info.action_space["shape"] == [2]
 
 
+@pytest.mark.slow
 def test_rebuilt_workers_are_as_new_ones(spec, start):
     workers = start(spec("Walk"), 3, n_workers=2)
     play(workers, 5)

@@ -126,6 +126,7 @@ def test_a_function_that_is_not_there(functions):
         load_function(f"{functions}:acts")
 
 
+@pytest.mark.slow
 def test_a_baseline_is_evaluated_as_a_policy_is(functions):
     zero = run_evaluation(EvalRequest("reach", baseline="zero", episodes=2))
     assert zero.lengths.mean == 120

@@ -83,6 +83,18 @@ def take(observations, k):
     return {key: part[k] for key, part in observations.items()} if isinstance(observations, dict) else observations[k]
 
 
+@pytest.mark.slow_except(
+    "ppo-samples",
+    "ppo, dict-samples",
+    "ppo, gSDE-samples",
+    "ppo, categories-samples",
+    "sac-samples",
+    "sac, image-mean",
+    "td3-uniform",
+    "crossq-mean",
+    "dqn-samples",
+    "recurrent_ppo-samples",
+)
 @pytest.mark.parametrize("exploration", EXPLORATIONS)
 @pytest.mark.parametrize("case", CASES)
 def test_the_bits_of_one_alone(policy, case, exploration):  # noqa: F811
@@ -94,6 +106,7 @@ def test_the_bits_of_one_alone(policy, case, exploration):  # noqa: F811
     check_rows(file, count, observations, EXPLORATIONS[exploration])
 
 
+@pytest.mark.slow_except("(64, 64)-mean", "(33,)-samples")
 @pytest.mark.parametrize("exploration", ["mean", "samples"])
 def test_the_bits_of_one_alone_in_wide_networks(wide, exploration):
     rng = np.random.default_rng(1)

@@ -137,6 +137,7 @@ def test_description_of_another_graph(pendulum, tmp_path):
         OnnxActor.load(path)
 
 
+@pytest.mark.slow
 def test_neither_torch_nor_sb3_is_imported(pendulum):
     code = (
         "import sys, numpy, rlctl\n"

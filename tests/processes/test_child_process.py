@@ -2,7 +2,6 @@
 
 import os
 import signal
-import struct
 import subprocess
 import sys
 import time
@@ -10,26 +9,9 @@ import time
 import pytest
 
 from rlctl.printed_lines import LineReader
-from rlctl.processes import messages
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill
 
-HERE = "tests.processes.test_child_process"
-
-
-def answer(connection, **arguments):
-    """What children do here: they print, say what they were given, and wait."""
-    print("out")
-    print("err", file=sys.stderr, flush=True)
-    given = {**arguments, "threads": os.environ["OMP_NUM_THREADS"], "hash": os.environ.get("PYTHONHASHSEED", "")}
-    messages.send(connection, given)
-    if arguments.get("exits"):
-        os._exit(arguments["exits"])
-    if arguments.get("starts"):
-        child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], **arguments["starts"])
-        messages.send(connection, child.pid)
-    if arguments.get("prints"):
-        os.write(connection.fileno(), struct.pack("!i", 5) + b"hello")
-    messages.receive(connection)
+ANSWER = "tests.processes.answering:answer"
 
 
 @pytest.fixture
@@ -37,14 +19,14 @@ def started():
     """Starts children, and returns the lines that they print."""
     children, lines = [], []
 
-    def start(**arguments):
+    def start(hash_seed="0", **arguments):
         reader = LineReader(lines.append)
         child = ChildProcess(
-            f"{HERE}:answer",
+            ANSWER,
             arguments,
             stdout=reader.descriptor,
             stderr=reader.descriptor,
-            env={"PYTHONHASHSEED": "7"},
+            env={"PYTHONHASHSEED": hash_seed},
         )
         reader.close_descriptor()
         children.append(child)
@@ -71,7 +53,7 @@ def wait_until_dead(pid):
 
 
 def test_a_child_gets_its_arguments_and_its_lines_are_read(started):
-    child, reader, lines = started(number=3)
+    child, reader, lines = started(hash_seed="7", number=3)
     assert child.receive() == {"number": 3, "threads": "1", "hash": "7"}
     child.send("go on")
     assert child.describe_end() == "ended with exit code 0"
@@ -89,6 +71,7 @@ def test_how_a_child_ended_is_reported(started):
     assert child.describe_end() == "was killed by SIGABRT"
 
 
+@pytest.mark.slow_except("options0")
 @pytest.mark.parametrize("options", [{"stdin": None}, {"start_new_session": True}])
 def test_closing_kills_what_the_child_has_started(started, options):
     child, *_ = started(starts=options)
@@ -114,7 +97,7 @@ def test_closing_kills_what_is_left_of_a_child_that_has_ended(started):
 def test_a_child_ends_with_its_parent():
     script = (
         f"from rlctl.processes.child_process import ChildProcess; import os, sys; "
-        f"child = ChildProcess('{HERE}:answer', {{}}, stdout=2, stderr=2); child.receive(); "
+        f"child = ChildProcess('{ANSWER}', {{}}, stdout=2, stderr=2); child.receive(); "
         f"print(child.process.pid, flush=True); os._exit(0)"
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=250, check=True)

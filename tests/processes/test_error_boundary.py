@@ -19,6 +19,7 @@ def shell(command, **environment):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "encoding", ["ascii:strict", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ascii", "latin-1:strict"))]
 )

@@ -78,6 +78,7 @@ def test_the_bodies_of_the_episode_are_read(workshop):
     assert arm.shapes[2].size == (0.05,)
 
 
+@pytest.mark.slow
 def test_links_are_drawn_where_the_last_substep_put_them(workshop, recording):
     arm = find(workshop, "arm")
     client = p.connect(p.DIRECT)
@@ -94,6 +95,7 @@ def test_links_are_drawn_where_the_last_substep_put_them(workshop, recording):
     np.testing.assert_array_equal(slide, arm.joint_positions)
 
 
+@pytest.mark.slow
 def test_a_body_that_comes_and_goes_is_drawn_while_it_exists(workshop, recording):
     assert find(workshop, "body 2").list_spans() == [range(LOADED, REMOVED)]
     cube = "/world/body\\ 2"
@@ -210,6 +212,7 @@ def test_functions_are_restored():
     assert type(p.loadMJCF) is type(p.connect)
 
 
+@pytest.mark.slow
 def test_an_episode_is_verified_filmed_and_pictured(workshop, tmp_path):
     file = tmp_path / "w.npz"
     save_episode(file, workshop.episode)
@@ -222,6 +225,7 @@ def test_an_episode_is_verified_filmed_and_pictured(workshop, tmp_path):
     assert [step for step, _ in strip.pictures] == [0, STEPS // 2, STEPS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file",
     [

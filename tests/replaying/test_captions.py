@@ -76,6 +76,7 @@ def test_a_world_without_a_ground_gets_a_floor_and_a_sky():
     assert np.ptp(corners[1].mean(axis=0)) > 2  # bluish squares, not grey
 
 
+@pytest.mark.slow
 def test_mujoco_draws_a_floor_too():
     with contextlib.closing(make_filmable(EnvSpec("reach", sim=MUJOCO))) as env:
         env.reset(seed=0)

@@ -48,6 +48,7 @@ def test_they_are_episodes_of_the_evaluation_bit_for_bit(run, tmp_path, capsys):
     assert "warning" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("off", "warns"), [(5e-15, False), (0.25, True)])
 def test_a_return_that_has_changed_since_the_choice_is_reported(run, tmp_path, monkeypatch, capsys, off, warns):
     def choose(*arguments):
@@ -59,6 +60,7 @@ def test_a_return_that_has_changed_since_the_choice_is_reported(run, tmp_path, m
     assert (", +0.25 off from when the episode was chosen" in capsys.readouterr().err) is warns
 
 
+@pytest.mark.slow
 def test_no_failures_is_an_answer(replay, run, tmp_path):
     done = replay(run.run.path, "--failures", 2, "--episodes", 2, "--set", "task.tolerance=9", "-o", "out")
     assert done.returncode == 0, done.stderr

@@ -32,6 +32,7 @@ def functions(write_module):
     return write_module("functions.py", source)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_it_records_and_reports_without_a_run(replay, tmp_path):
     done = replay(TUMBLE, "--policy", "zero")
@@ -61,6 +62,7 @@ def test_a_narrow_terminal_has_fewer_columns(tmp_path, monkeypatch):
     assert max(map(len, tables)) <= 60
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_recording_has_the_actions_of_the_function(functions, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -72,6 +74,7 @@ def test_the_recording_has_the_actions_of_the_function(functions, tmp_path, monk
     assert run_replay(ReplayRequest(None, verify=episode.episode)).verification.difference is None
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_look_replaces_the_last_one_of_the_same_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -83,6 +86,7 @@ def test_a_look_replaces_the_last_one_of_the_same_policy(tmp_path, monkeypatch):
     assert [first.recording.name, second.recording.name] == ["000000.rrd", "000001.rrd"]
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_as_json_it_has_what_the_tables_have(replay):
     world = as_json(replay(TUMBLE, "--policy", "zero", "--json", "-"))["world"]
@@ -96,6 +100,7 @@ def test_as_json_it_has_what_the_tables_have(replay):
     ).items()
 
 
+@pytest.mark.slow
 def test_settings_and_choices_apply(tmp_path):
     request = ReplayRequest("reach", baseline="zero", settings=["task.tolerance=2"], output=tmp_path / "a.rrd")
     (episode,) = run_replay(request).episodes
@@ -104,6 +109,7 @@ def test_settings_and_choices_apply(tmp_path):
     assert worst.choice == "the worst of 3 episodes, of which 0 succeeded (seed 0)"
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_film(tmp_path):
     result = run_replay(ReplayRequest(TUMBLE, baseline="zero", video=tmp_path / "look.gif"))
@@ -157,6 +163,7 @@ def test_an_episode_without_an_end_is_cut(tmp_path, capsys, write_module):
     assert "cut after 1,000 steps, because no time limit is known" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_an_error_of_the_function_is_one_line_with_the_step(replay, functions):
     done = replay(TUMBLE, "--policy", f"{functions}:breaks")
@@ -194,6 +201,7 @@ def test_a_task_without_a_run_is_shown_how_to_look(replay):
     assert "To see it before a training: rlctl replay robot.py:Robot --policy zero" in done.stderr
 
 
+@pytest.mark.slow
 def test_it_imports_neither_torch_nor_scipy(tmp_path):
     code = """
         import sys

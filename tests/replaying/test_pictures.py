@@ -35,6 +35,7 @@ def short_episode(reached, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_gif_of_a_robot_and_its_goal(short_episode, tmp_path):
     film = run_replay(ReplayRequest(str(short_episode), video=tmp_path / "reach.gif")).film
@@ -48,6 +49,7 @@ def test_gif_of_a_robot_and_its_goal(short_episode, tmp_path):
     assert ((red > 180) & (green < 130) & (blue < 60)).sum() > 200  # the arm's joints
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_mp4_plays(short_episode, tmp_path):
     av = pytest.importorskip("av")
@@ -129,6 +131,7 @@ def test_a_film_and_recordings_in_one_call(short_episode, tmp_path):
     assert files["video"].is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_filmed_and_recorded_episode_of_a_policy_repeats(tmp_path):
     request = ReplayRequest("reach", baseline="zero", video=tmp_path / "film.gif", output=tmp_path, size="64x64")

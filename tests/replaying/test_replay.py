@@ -55,6 +55,7 @@ def test_rollout_is_reproduced_bit_for_bit(run, tmp_path):
     result.check()
 
 
+@pytest.mark.slow
 def test_same_seed_same_episodes_and_more_of_them_start_the_same(run, tmp_path):
     def returns(episodes: int, seed: int):
         request = ReplayRequest(str(run.run.path), episodes=episodes, seed=seed, output=tmp_path / "out")
@@ -78,6 +79,7 @@ def test_task_and_parameters_can_be_others(run, tmp_path):
     assert layout(episode.recording, "PanelBlueprint:state", "/blueprint_panel") == [1]
 
 
+@pytest.mark.slow
 def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_path):
     done = replay(run.run.path, "-o", "a b.rrd")
     assert done.returncode == 0, done.stderr
@@ -91,6 +93,7 @@ def test_command_line_from_a_run_to_the_command_that_opens_it(replay, run, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a b.npz", "a b.rrd"]
 
 
+@pytest.mark.slow
 def test_result_as_json(run, tmp_path):
     content = as_json(run_replay(ReplayRequest(str(run.run.best_policy), episodes=2, output=tmp_path)))
     files = [tmp_path / name for name in ("000000.rrd", "000001.rrd")]
@@ -109,6 +112,7 @@ def test_result_as_json(run, tmp_path):
     assert content["versions"].keys() >= {"rlctl", "pybullet"}
 
 
+@pytest.mark.slow
 def test_policy_without_a_run_records_into_the_current_folder(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copy(run.run.best_policy, "policy.safetensors")
@@ -116,6 +120,7 @@ def test_policy_without_a_run_records_into_the_current_folder(run, tmp_path, mon
     assert names == ["episodes/000000.rrd", "episodes/000001.rrd"]
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_recorded_episode_is_recorded_beside_itself(replay, episode_file, tmp_path):
     own = shutil.copy(episode_file, tmp_path)
@@ -137,6 +142,7 @@ def test_episode_that_differs_is_reported_and_written(tmp_path):
     assert warning.endswith("5 of 11 steps differ")
 
 
+@pytest.mark.slow
 def test_episode_of_a_plain_environment_from_the_command_line(replay, tmp_path):
     rollout, _ = play("Pixels", fault="render")
     save_episode(tmp_path / "one.npz", rollout.episode)
@@ -146,6 +152,7 @@ def test_episode_of_a_plain_environment_from_the_command_line(replay, tmp_path):
     assert (tmp_path / "recordings" / "one.rrd").is_file()
 
 
+@pytest.mark.slow
 def test_what_an_environment_prints_stays_out_of_the_result(replay, tmp_path):
     rollout, _ = play("Pixels", fault="talk")
     save_episode(tmp_path / "one.npz", rollout.episode)
@@ -201,6 +208,7 @@ def test_policy_for_another_task(run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_environment_that_fails(replay, tmp_path):
     rollout, _ = play("Pixels")
     spec = dataclasses.replace(rollout.episode.info.spec, parameters={"fault": "step"})

@@ -125,6 +125,7 @@ def test_layout_is_in_the_file(recording):
     assert len(reader(recording).blueprints()) == 1
 
 
+@pytest.mark.slow
 def test_same_episode_same_recording_id(recording, tmp_path):
     write_rrd(tmp_path / "again.rrd", reach(5), title="again", warn=print)
     write_rrd(tmp_path / "other.rrd", reach(6), title="other", warn=print)
@@ -186,6 +187,7 @@ def test_events_are_readable_in_both_themes(background):
         assert (high + 0.05) / (low + 0.05) > 3.9
 
 
+@pytest.mark.slow
 def test_free_body_moves_by_its_link_frame(tumble):
     path, rollout, _ = tumble
     cube = next(body for body in rollout.scene.bodies if body.name == "cube")
@@ -209,6 +211,7 @@ def test_ground_is_a_box_and_no_mesh(tumble):
     assert static(path, "/world/ground", "Boxes3D:half_sizes")
 
 
+@pytest.mark.slow
 def test_rough_ground_is_a_mesh_of_its_heights(tmp_path):
     rollout, warnings = play("Rough", car="r2d2.urdf")
     write_rrd(tmp_path / "rough.rrd", rollout, title="rough", warn=warnings.append)

@@ -56,6 +56,7 @@ def test_training_episodes_are_the_same_again(run):
         assert verify_episode(load_episode(path), path)[1].difference is None
 
 
+@pytest.mark.slow
 def test_smallest_change_is_found_and_named(replay, tampered, episode):
     observations = episode.observations.copy()
     observations[17, 16] = np.nextafter(observations[17, 16], np.float32(1.0))  # the hand's height, by its last bit

@@ -32,6 +32,7 @@ def changed_run(rlctl, write_module, tmp_path):
     return sorted((tmp_path / "runs" / "Toy").iterdir(), key=lambda path: path.name[-1])
 
 
+@pytest.mark.slow
 def test_a_rewritten_reward_is_noticed(rlctl, changed_run, write_module):
     old, new = changed_run
     is_changed = "toy.py has changed since the run began"

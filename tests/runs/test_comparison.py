@@ -141,6 +141,7 @@ def test_seeds_that_have_not_finished_are_not_compared(root, monkeypatch):
     assert len(compare(texts, EvalRequest(None, episodes=1), force=True).candidates[0].side.runs) == 2
 
 
+@pytest.mark.slow
 def test_policy_files_are_compared(root, tmp_path, rlctl):
     one, two = sorted((root / "0.9/Line").iterdir())
     kept = shutil.copy(one / "policies/best.safetensors", tmp_path / "kept.safetensors")

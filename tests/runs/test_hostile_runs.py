@@ -94,6 +94,7 @@ def test_a_status_that_is_nested_deeply(depth, write_run):
     assert summarize(folder).reason == "run.json: damaged: nested too deeply"
 
 
+@pytest.mark.slow_except("stages: {a: 1}")
 @pytest.mark.parametrize("recipe", ["algo: [ppo]", "algo_kwargs: 5", "stages: {a: 1}", "algo: {ppo: 1}"])
 def test_a_recipe_of_other_types_is_not_diagnosed(recipe, write_run, capsys):
     folder = write_run("reach/2026-11-21_10-00-00_s0", metrics=[(step, 0.5, 1.0) for step in range(12)])
@@ -109,12 +110,14 @@ def test_an_evaluation_at_no_step_is_left_out(write_run, capsys):
     assert summarize(folder).best_step == 500
 
 
+@pytest.mark.slow
 def test_half_a_surrogate_pair_is_reported(write_run, tmp_path):
     folder = write_run("reach/2026-11-21_10-00-00_s0", status="failed", error="\ud800")
     write_report([str(folder)], target=tmp_path / "report.html", pictures=False)
     assert r"\ud800" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow_except("1")
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_whatever_a_run_holds_it_is_shown(write_run, seed, tmp_path):

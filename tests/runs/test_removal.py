@@ -96,6 +96,7 @@ def test_asks_only_on_a_terminal(write_run, rlctl):
     assert not run.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["\x03", "\x04"], ids=["Ctrl-C", "Ctrl-D"])
 def test_interrupted_at_the_question(write_run, answer):
     run = write_run("reach/2026-01-01_00-00-00_s0")

@@ -103,6 +103,7 @@ def test_command_for_another_algorithm_trains_the_same_recipe(write_run):
     assert resolve("reach", None, {"seed": 3, **parse_settings(words[6::2])}) == other
 
 
+@pytest.mark.slow
 def test_group_is_drawn_with_a_band(group):
     page = write(group[0].parent)
     assert "reach, ppo, seeds 0, 1, 2" in page
@@ -130,6 +131,7 @@ def test_a_band_per_recipe(group):
     assert "not compared: learning_rate 0.002: a single run cannot be compared" in write(*group)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("form", "begins"), [("svg", b"<?xml"), pytest.param("pdf", b"%PDF-", marks=pytest.mark.slow)])
 def test_curves_for_a_paper(group, rlctl, form, begins):
     write_recipes(group, a={"learning_rate": 0.001}, b={"learning_rate": 0.001}, c={"learning_rate": 0.002})
@@ -140,6 +142,7 @@ def test_curves_for_a_paper(group, rlctl, form, begins):
     assert form == "pdf" or content.count(b">learning_rate 0.001</text>") == 2  # legends of return and success
 
 
+@pytest.mark.slow
 def test_a_bad_result_is_not_called_usual(write_run):
     run = write_run("reach/2026-11-21_10-00-00_s0", evals=((1000, 0.088, 1.0),))
     page = write(run)
@@ -190,6 +193,7 @@ def write_two_recipes(write_run):
     return ["runs/reach/ppo", "runs/reach/a2c/"]
 
 
+@pytest.mark.slow
 def test_curves_name_the_folders_that_the_user_named(write_run):
     texts = write_two_recipes(write_run)
     picture = write(*texts, form="svg", target=Path("curves.svg"))
@@ -210,6 +214,7 @@ def test_labels_of_the_user(write_run):
         write(*texts, form="csv", labels=["ours", "ours"])
 
 
+@pytest.mark.slow
 def test_a_seed_that_still_trains_has_not_ended_early(write_run, hold_lock):
     texts = write_two_recipes(write_run)
     run = next(Path("runs/reach/a2c").glob("*/s1"))
@@ -237,6 +242,7 @@ def test_groups_named_by_time_have_the_name_of_the_setting_that_differs(write_ru
     assert [recipe.label for recipe in report.recipes] == ["learning_rate 0.001", "learning_rate 0.01"]
 
 
+@pytest.mark.slow
 def test_no_episodes_are_no_error_where_none_are_played(group):
     assert "</svg>" in write(group[0], target=Path("curves.svg"), episodes=0)
     assert "steps" in write(group[0], target=Path("table.csv"), episodes=0)
@@ -302,6 +308,7 @@ def test_markdown_is_printed_for_pull_requests(group, rlctl):
     assert "```\nrlctl train reach --seed 0" in done.stdout
 
 
+@pytest.mark.slow
 def test_run_in_progress_is_reported_as_such(group, hold_lock):
     status = json.loads((group[0] / "run.json").read_text())
     (group[0] / "run.json").write_text(json.dumps({**status, "status": "running"}))
@@ -361,6 +368,7 @@ def test_browser_shows_it(group, tmp_path, width):
     assert "the best policies of 3 trainings" in done.stdout
 
 
+@pytest.mark.slow
 def test_legends_have_the_names_of_single_runs(group):
     write_recipes(group[:2], a={"learning_rate": 0.001}, b={"learning_rate": 0.002})
     page = write(*group[:2], episodes=0)
@@ -375,6 +383,7 @@ def test_results_alone_are_a_table(group, tmp_path):
     assert row.startswith(f"| reach/{group[0].name} |  | ppo | 0 |")
 
 
+@pytest.mark.slow
 def test_curves_are_drawn_as_png(group, tmp_path):
     path = write_report([str(group[0])], "png", tmp_path / "curves.png")
     assert path.read_bytes().startswith(b"\x89PNG")
@@ -420,6 +429,7 @@ def make_measured(rates):
     )
 
 
+@pytest.mark.slow
 def test_difference_of_two_maps():
     one, two = make_measured([0.2, 0.5, 0.5, 1.0]), make_measured([0.9, 0.55, 0.1, 1.0])
     result = comparison_map.subtract(("one", "two"), one, two)
@@ -432,6 +442,7 @@ def test_difference_of_two_maps():
     assert b"two minus one" in plots.draw_differences(result, "svg")
 
 
+@pytest.mark.slow
 def test_maps_of_a_policy_are_a_picture():
     measured = make_measured([0.2, 0.5, 0.5, 1.0])
     assert plots.draw_maps(measured, "png").startswith(b"\x89PNG")
@@ -443,6 +454,11 @@ def test_maps_of_a_policy_are_a_picture():
         plots.choose_form(Path("map.jpg"))
 
 
+@pytest.mark.slow_except(
+    "arguments0---vary compares two policies, the baseline first",
+    "arguments1---vary draws a map and judges nothing",
+    "arguments2---picture draws maps: add --vary",
+)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -93,6 +93,7 @@ def make_both():
         env.close()
 
 
+@pytest.mark.slow_except("all, at a level")
 @pytest.mark.parametrize("case", EVENTS)
 def test_an_episode_has_the_same_bits_alone_and_among_others(make_both, case):
     env, batch = make_both(5, **EVENTS[case])
@@ -110,6 +111,7 @@ def test_an_episode_has_the_same_bits_alone_and_among_others(make_both, case):
     assert len(lengths) > 2  # so worlds began episodes at different times
 
 
+@pytest.mark.slow
 def test_a_batch_of_one_world(make_both):
     env, batch = make_both(1, randomize=True)
     episodes = play_together(batch, lambda _, worlds: worlds)

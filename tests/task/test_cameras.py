@@ -124,6 +124,7 @@ def test_pictures_depend_on_the_seed_only(make_worlds):
     assert (seen[0]["front"][0] != seen[-1]["front"][0]).any()  # the stool falls
 
 
+@pytest.mark.slow
 @needs_egl
 def test_some_worlds_begin_again_while_others_play(make_worlds):
     worlds = make_worlds(3)
@@ -146,6 +147,7 @@ def test_only_what_is_named_is_drawn(make_worlds):
         make_worlds(1, observing=Observing(["frnt"]))
 
 
+@pytest.mark.slow
 @needs_egl
 def test_noise_and_delay_act_on_pictures(make_worlds):
     class Late(SeenStool):

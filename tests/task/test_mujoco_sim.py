@@ -167,6 +167,7 @@ def test_what_mujoco_has_not_is_named(task, parameters, missing):
 needs_egl = pytest.mark.skipif(ctypes.util.find_library("EGL") is None, reason="needs libEGL")
 
 
+@pytest.mark.slow
 @needs_egl
 def test_markers_are_drawn_where_they_are_moved():
     with closing(EnvSpec("reach", sim=MUJOCO).make("rgb_array")) as env:
@@ -193,6 +194,7 @@ def test_a_near_body_is_drawn_whole_on_wide_ground():
     assert (seen != without).any(axis=2).sum() > 30
 
 
+@pytest.mark.slow
 @needs_egl
 def test_a_task_draws_without_a_display(monkeypatch):
     # In a process of its own: MuJoCo chooses at its import how to draw, and GLFW would end the process.
@@ -216,6 +218,7 @@ class Camera(gymnasium.Env):
 """
 
 
+@pytest.mark.slow
 @needs_egl
 def test_a_constructor_draws_without_a_display(monkeypatch, tmp_path):
     for name in ("DISPLAY", "MUJOCO_GL"):

@@ -47,6 +47,7 @@ def test_a_camera_of_ten_pictures_a_second(env):
     assert all(step % 6 == 0 for step in changes)  # of 60 control steps a second
 
 
+@pytest.mark.slow
 def test_pressing_repeats_bit_for_bit(env):
     first, _, _ = press(env, 1)
     press(env, 2)

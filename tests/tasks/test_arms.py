@@ -38,6 +38,7 @@ def write(folder, *parts):
     (folder / "robot.urdf").write_text(f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8")
 
 
+@pytest.mark.slow_except("parts4-tool0-joints4")
 @pytest.mark.parametrize(
     ("parts", "tip", "joints"),
     [
@@ -75,6 +76,7 @@ def test_the_tip(tmp_path, monkeypatch, parts, tip, joints):
     assert f"JOINTS = {joints}".replace("'", '"') in task
 
 
+@pytest.mark.slow
 def test_a_link_that_turns_on_the_spot_brings_its_end_to_the_goal(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     turn = joint("turn", "foot", "one", axis="0 1 0", kind="continuous", limit="")
@@ -90,6 +92,7 @@ def test_a_link_that_turns_on_the_spot_brings_its_end_to_the_goal(tmp_path, monk
         assert task.find_tip() == pytest.approx([0.1, 0.0, 0.1], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_what_hangs_below_its_base_is_raised(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hanging = link("one", middle="0 0 -0.05")

@@ -22,6 +22,7 @@ LEVER = """<mujoco model="lever"><compiler angle="radian"/><worldbody>
 </body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_dog_with_hobby_servos(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path)
@@ -40,6 +41,7 @@ def test_a_dog_with_hobby_servos(tmp_path, monkeypatch):
     assert joints.drive_gain == pytest.approx([32.0] * 12)
 
 
+@pytest.mark.slow
 def test_motors_that_are_too_weak(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path)

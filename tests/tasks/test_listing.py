@@ -40,6 +40,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow_except("no_equals_sign", "not_utf8", "gone")
 @pytest.mark.parametrize("kind", BROKEN)
 def test_a_broken_distribution_is_one_broken_row(rlctl, install, kind):
     points, problem = BROKEN[kind]

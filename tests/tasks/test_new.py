@@ -82,6 +82,7 @@ def test_it_passes_every_check_before_it_is_installed(rlctl, plugin):
     assert "no findings" in result.stdout
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass_before_it_is_installed(plugin, tmp_path):
     assert "4 passed" in run("pytest", "-q", "-p", "no:cacheprovider", "my-arm", cwd=tmp_path)
 
@@ -177,6 +178,7 @@ def model(tmp_path, monkeypatch):
     return file
 
 
+@pytest.mark.slow
 def test_a_plugin_of_a_users_own_model(model, tmp_path):
     plugin = new.create("two-arms", model="given/arm.urdf")
     package = plugin.folder / "two_arms"

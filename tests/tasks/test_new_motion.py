@@ -40,6 +40,7 @@ def create(name: str, *clips: str, **options) -> new.NewPlugin:
     return new.create(name, model="dog.xml", motions=clips, clip=ClipOptions(**options))
 
 
+@pytest.mark.slow
 def test_a_plugin_of_a_clip(folder):
     plugin = create("dog-bends", "bend_30hz.csv")
     assert "follows a clip of 2.97 s" in plugin.summary

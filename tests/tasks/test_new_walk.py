@@ -66,6 +66,7 @@ def check_that_it_stands(plugin: new.NewPlugin, feet: list[str], height: float) 
         assert task.height == pytest.approx([height], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_plugin_of_a_users_dog(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path)
@@ -114,6 +115,7 @@ def test_two_legs_step_in_time_with_a_clock(tmp_path, monkeypatch):
     assert wanted[1 - first] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("legs", "stance"),
     [("0 0.7 -1.4", [0.0, 0.7, -1.4]), ("0 1.6 -2.5", None)],  # legs that are folded are no stance
@@ -127,6 +129,7 @@ def test_the_stance_of_a_keyframe(tmp_path, monkeypatch, legs, stance):
     assert (list(task.stance[:3]) == stance) == (stance is not None)
 
 
+@pytest.mark.slow
 def test_two_legs_that_only_turn_about_y(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = write_dog(tmp_path, pairs=(0.0,))
@@ -140,6 +143,7 @@ def test_two_legs_that_only_turn_about_y(tmp_path, monkeypatch):
     assert np.isfinite(reward)
 
 
+@pytest.mark.slow
 def test_sprawled_legs_stand_to_the_sides():
     """The ant's hips turn about z: all feet are level, farther out than the hips, and the body is off the ground."""
     with contextlib.closing(MujocoSim(control_dt=0.02, substeps=4)) as sim:
@@ -216,6 +220,7 @@ def test_what_cannot_be_is_said(tmp_path, monkeypatch, before, after, note):
     assert re.search(note, new.create("odd-dog", model="dog.xml", walk=True).summary)
 
 
+@pytest.mark.slow
 def test_a_mirror_that_the_masses_do_not_have_is_left_out(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = write_dog(tmp_path)

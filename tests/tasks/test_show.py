@@ -226,6 +226,7 @@ def test_options_of_the_list_are_not_lost(rlctl):
     assert "Did you mean 'show'?" in rlctl("tasks", "sho").stderr
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_link_with_an_impossible_inertia_is_named(write_module, rlctl):
     source = EVERYTHING.replace("def build(self, sim): ...", 'def build(self, sim): sim.load("block", "block.urdf")')

@@ -113,6 +113,7 @@ def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow_except("ppo")
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [(PpoGradients, PPO), (SacGradients, SAC), (TqcGradients, TQC), slow(Td3Gradients, TD3), slow(DqnGradients, DQN)],

@@ -69,6 +69,7 @@ def test_a_downloaded_run_imports_no_callback(train, resume, monkeypatch):
         resume(run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
 @pytest.mark.usefixtures("every_boundary")
 def test_resume_is_exact_with_a_schedule_that_a_callback_changes(train, resume, kill_after, run_of, capsys, algo):
@@ -86,6 +87,7 @@ def test_resume_is_exact_with_a_schedule_that_a_callback_changes(train, resume, 
     assert (whole.path / "end.txt").read_text() == (run.path / "end.txt").read_text()
 
 
+@pytest.mark.slow
 def test_state_that_is_no_plain_data_is_reported(train, resume, run_of, capsys):
     with pytest.raises(TaskError):
         train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Unsaved": None, f"{FILE}:Raises": None}})
@@ -96,6 +98,7 @@ def test_state_that_is_no_plain_data_is_reported(train, resume, run_of, capsys):
     assert re.search(f"resuming at step 0, not bit-exact: callback .*{problem}", capsys.readouterr().err)
 
 
+@pytest.mark.slow_except("on_start")
 @pytest.mark.parametrize("moment", ["on_start", "on_segment", "on_evaluation", "on_checkpoint", "on_end"])
 @pytest.mark.usefixtures("every_boundary")
 def test_a_callback_that_raises(train, run_of, moment):
@@ -142,6 +145,7 @@ def test_a_wrong_name_is_a_recipe_error(train, tmp_path, name, problem):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_a_file_of_another_machine_is_found_beside_its_recipe(train, tmp_path, monkeypatch):
     (tmp_path / "count.py").write_text("import rlctl\n\n\nclass Count(rlctl.Callback):\n    pass\n")
     monkeypatch.chdir(tmp_path)
@@ -149,6 +153,7 @@ def test_a_file_of_another_machine_is_found_beside_its_recipe(train, tmp_path, m
     assert list(run.recipe().callbacks) == [f"{tmp_path}/count.py:Count"]
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page(train, tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "callbacks.md").read_text()
     (code,) = re.findall(r"`my\.py`:\n\n```python\n(.*?)```", page, re.DOTALL)
@@ -180,6 +185,7 @@ def test_wrong_arguments_and_parameters_are_named(train):
         train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:WrongParameter": None}})
 
 
+@pytest.mark.slow
 def test_a_callback_whose_file_has_changed_needs_force(train, resume, tmp_path, capsys):
     file = Path(shutil.copy(FILE, tmp_path / "mine.py"))
     run = train("Line", {**SMALL_PPO, "callbacks": {f"{file}:Adaptive": {"stop_after": 64}}}).run
@@ -190,6 +196,7 @@ def test_a_callback_whose_file_has_changed_needs_force(train, resume, tmp_path, 
     assert "not bit-exact: " in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_callbacks_of_stable_baselines3(train, tmp_path):
     folder = {"folder": str(tmp_path)}
     four = {"evaluation": folder, "several": folder, "Worst": None, "convert": None}
@@ -204,6 +211,7 @@ def test_callbacks_of_stable_baselines3(train, tmp_path):
     assert [event.step for event in written] == [64, 128]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algo", ["ppo", "sac"])
 @pytest.mark.usefixtures("every_boundary")
 def test_resume_is_exact_with_a_callback_of_stable_baselines3(train, resume, kill_after, run_of, capsys, algo):

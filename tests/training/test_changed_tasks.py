@@ -90,6 +90,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow_except("upgraded")
 @pytest.mark.parametrize("what", CHANGES)
 def test_another_task_is_refused_unless_forced(plugin, resume, capfd, what):
     folder, run = plugin
@@ -119,6 +120,7 @@ def test_a_plugin_that_is_gone(plugin, resume):
     assert run.status_file.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_other_spaces(plugin, resume):
     folder, run = plugin
     change(folder, "size = 1", "size = 2")
@@ -132,6 +134,7 @@ def test_other_spaces(plugin, resume):
     assert run.status()["status"] == "finished"
 
 
+@pytest.mark.slow
 def test_other_libraries_are_named(killed, resume, monkeypatch, capfd):
     versions = checkpoint_file.collect_versions
     with monkeypatch.context() as patch:
@@ -155,6 +158,7 @@ SAC = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [pytest.param(TINY, marks=pytest.mark.slow), SAC], ids=["ppo", "sac"])
 def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume, capfd, settings):
     run = killed("Unseeded", settings)
@@ -179,6 +183,7 @@ def test_an_environment_that_no_seed_reaches_begins_new_episodes(killed, resume,
     resume(run, total_timesteps=160)  # and it can be gone on with
 
 
+@pytest.mark.slow
 def test_an_environment_that_fails_in_the_replay_begins_new_episodes(killed, resume, tmp_path, capfd, write_module):
     file = write_module(
         "fragile.py",
@@ -221,6 +226,7 @@ def intrusive(write_module):
     )
 
 
+@pytest.mark.slow
 def test_an_import_changes_nothing_of_ours(train, intrusive):
     folder, errors = os.getcwd(), np.geterr()
     whole = train("Line", TINY).run

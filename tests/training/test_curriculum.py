@@ -49,6 +49,7 @@ def staged(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_promotion_by_success(staged):
     run = staged.run
     assert column(run.metrics_file, "steps") == [64, 128, 192, 256]
@@ -57,6 +58,7 @@ def test_promotion_by_success(staged):
     assert (staged.progress.stage, len(staged.recipe.stages), run.status()["stage"]) == (2, 2, 2)
 
 
+@pytest.mark.slow
 def test_evaluation_is_always_in_the_last_stage(staged):
     assert column(staged.run.evals_file, "success", float) == [0.0, 0.0]
     assert column(staged.run.evals_file, "stage") == [2, 2]  # what the policy is trained in from this step on
@@ -105,6 +107,7 @@ def test_eval_of_a_stage_that_is_not_there(staged, stage):
         run_evaluation(EvalRequest(str(staged.run.path), stage=stage))
 
 
+@pytest.mark.slow
 def test_without_stages_there_is_no_stage_anywhere(train, small_ppo):
     result = train("Line", small_ppo)
     assert "stage" not in rows(result.run.metrics_file)[0]
@@ -113,6 +116,7 @@ def test_without_stages_there_is_no_stage_anywhere(train, small_ppo):
         run_evaluation(EvalRequest(str(result.run.path), stage=1))
 
 
+@pytest.mark.slow
 def test_promotion_by_return_in_plain_lines(train, small_ppo, capsys):
     # An episode returns -10 * cost: -10 reaches -10, and -20 does not reach -15.
     stages = [
@@ -137,6 +141,7 @@ def test_live_display_shows_the_stage():
     assert "  stage 2 of 3: cost 2.0  (after 64 steps: return" in console.file.getvalue()
 
 
+@pytest.mark.slow
 def test_promotion_does_not_depend_on_time_or_on_the_number_of_workers(staged, train, small_ppo, use_cores):
     with use_cores(1 if available_cores() > 1 else None):
         again = train("Staged", {**small_ppo, "stages": BY_SUCCESS})
@@ -148,6 +153,7 @@ def test_promotion_does_not_depend_on_time_or_on_the_number_of_workers(staged, t
     ]
 
 
+@pytest.mark.slow
 def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
     stages = [
         {"task": EASY, "promote": {"success": 1.0, "window": 4}},
@@ -165,6 +171,7 @@ def test_resume_goes_on_in_the_middle_of_a_stage(train, resume, small_ppo):
     assert column(result.run.metrics_file, "success", float) == [1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
 
 
+@pytest.mark.slow
 def test_a_stage_that_is_done_with_the_training_is_left_by_its_resume(train, resume, small_ppo):
     stages = [{"task": EASY, "promote": {"success": 1.0, "window": 4}}, {"task": HARD}]
     result = train("Staged", {**small_ppo, "total_timesteps": 64, "stages": stages})
@@ -174,6 +181,7 @@ def test_a_stage_that_is_done_with_the_training_is_left_by_its_resume(train, res
     assert column(result.run.metrics_file, "success", float) == [1.0, 0.0]
 
 
+@pytest.mark.slow
 def test_an_off_policy_algorithm_keeps_its_replay_buffer(train):
     stages = [
         {"task": {"cost": 1.0}, "promote": {"return": -10.0, "window": 4, "min_steps": 48}},
@@ -249,6 +257,7 @@ def test_reach_in_stages_of_its_class(write_module, tmp_path):
     assert near.terms["reached"] > exact.terms["reached"]
 
 
+@pytest.mark.slow
 def test_success_of_a_task_that_has_none_is_refused(write_module, tmp_path, small_ppo):
     task = f"{write_module('my_reach.py', REACH)}:NoSuccess"
     with pytest.raises(RecipeError, match=r"^stage 1 of 2: promote.success: .*NoSuccess does not report success"):

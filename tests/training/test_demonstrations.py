@@ -109,6 +109,7 @@ CASES = {
 QUICK = {"ppo, dict", "sac with gSDE, normalised", "td3"}  # each in another branch of the cloning
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )
@@ -131,6 +132,7 @@ def test_discrete_actions_are_cloned(record, tmp_path):
     assert [int(policy.predict(np.array([x], np.float32))) for x in (-0.3, -0.1, 0.1, 0.3)] == [1, 1, 0, 0]
 
 
+@pytest.mark.slow_except("sac-actor.log_std.bias")
 @pytest.mark.parametrize(("case", "name"), [("ppo", "log_std"), ("sac", "actor.log_std.bias")])
 def test_noise_and_normalisation_after_cloning(record, train, monkeypatch, case, name):
     monkeypatch.setattr(demonstrations, "_UPDATES", 1)
@@ -247,6 +249,7 @@ def test_a_truncated_file(changed, train):
         train("Line", TINY, demos=str(file.parent))
 
 
+@pytest.mark.slow
 def test_failed_episodes_are_left_out(changed, train, monkeypatch, capfd):
     monkeypatch.setattr(demonstrations, "_UPDATES", 10)
     train("Line", TINY, demos=str(changed(info=flip_success)))
@@ -268,6 +271,7 @@ def test_with_another_source(record, train):
         train("Line", TINY, demos=str(record("Line")), initial_policy="reach")
 
 
+@pytest.mark.slow
 def test_exit_codes(rlctl, tmp_path):
     task = f"{ENVS}:Line"
     empty = rlctl("train", task, "--demos", ".", "--no-check")

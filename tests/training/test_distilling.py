@@ -120,6 +120,7 @@ def test_a_student_sees_what_its_teacher_saw_unless_it_is_told_otherwise():
     assert other["task"] == {"tolerance": 0.2}
 
 
+@pytest.mark.slow
 def test_a_student_learns_the_teachers_actions(run, line):
     settings = {"total_timesteps": 1024, "algo_kwargs": {"n_steps": 64, "n_epochs": 20}}
     result = run(line, {**settings, "policy_kwargs": {"net_arch": [16]}})

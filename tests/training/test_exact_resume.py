@@ -115,6 +115,8 @@ QUICK = {
 }
 
 
+# Takes seconds, and runs in every `make test`: exact resume, on and off policy.
+@pytest.mark.slow_except("ppo with gSDE", "sac, hindsight, normalised")
 @pytest.mark.parametrize(
     "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )
@@ -174,6 +176,7 @@ def newest_other_than(run):
     return RunDirectory(other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "steps", "evaluated"), [("ppo", 40, "128"), pytest.param("dqn", 20, "64", marks=pytest.mark.slow)]
 )

@@ -30,6 +30,7 @@ CASES = {
 QUICK = ("plain", "discrete", "reset")
 
 
+@pytest.mark.slow_except("plain")
 @pytest.mark.parametrize(
     "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )
@@ -75,6 +76,7 @@ def test_the_command_that_the_error_names(rlctl, tmp_path):
     assert "), but not when it was replayed" in mended.stderr
 
 
+@pytest.mark.slow
 def test_it_is_of_the_stage_it_was_in(fail):
     rule = {"promote": {"success": 0.5, "window": 2}}
     settings = {**TINY, "stages": [{"task": {"last": False}, **rule}, {"task": {"last": True}}]}

@@ -31,6 +31,7 @@ def only_run(tmp_path):
     return lookup.find_run("latest", tmp_path / "runs")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -73,6 +74,7 @@ def test_it_can_be_replayed(train, settings, tmp_path):
         run_replay(ReplayRequest(str(file)))
 
 
+@pytest.mark.slow
 def test_none_ever_succeeded(train, settings, tmp_path, rlctl):
     with pytest.raises(TaskError, match="4 of its evaluations failed, the first at step 32"):
         train("FailsWhenEvaluated", settings(1, 2, 3, 4), envs=FAULTY)
@@ -83,6 +85,7 @@ def test_none_ever_succeeded(train, settings, tmp_path, rlctl):
     assert run.last_policy.exists()
 
 
+@pytest.mark.slow
 def test_a_resume_remembers(train, resume, settings, tmp_path, monkeypatch):
     from rlctl.training.checkpoints import Checkpoints
 
@@ -105,6 +108,7 @@ def test_a_resume_remembers(train, resume, settings, tmp_path, monkeypatch):
         resume(run)
 
 
+@pytest.mark.slow
 def test_the_task_is_removed_while_training(train, resume, tmp_path, settings):
     """Then no fresh environment can be built, and those that are there go on."""
     task = tmp_path / "mine.py"

@@ -60,6 +60,7 @@ HANGS = ("stopped", "endless", "sleep")
 QUICK = ("raise", "out of memory")
 
 
+@pytest.mark.slow_except("raise")
 @pytest.mark.parametrize(
     "fault",
     [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in (*ENDS, *HANGS)],
@@ -108,6 +109,7 @@ def test_an_environment_that_cannot_be_built_leaves_no_run(train, tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_child_left")
 def test_bad_behaviour_changes_nothing(train, whole, capfd):
     run = train("Misbehaving", TINY, envs=ENVS).run
@@ -148,6 +150,7 @@ def test_observations_outside_their_space_are_counted_and_reported(train, capfd)
     assert run.status()["observations_outside"] == 2 * 3
 
 
+@pytest.mark.slow
 def test_a_file_system_without_locks_is_warned_of(train, monkeypatch, capfd):
     def flock(*_):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))

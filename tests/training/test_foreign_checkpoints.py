@@ -14,6 +14,7 @@ def runs(train):
     return [train("Line", {**TINY, "seed": seed, "total_timesteps": 128 * (seed + 1)}).run for seed in (0, 1)]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_run_is_not_used(runs, resume, capsys):
     run, other = runs
     shutil.copytree(other.checkpoint(256), run.checkpoint(256))
@@ -24,6 +25,7 @@ def test_a_checkpoint_of_another_run_is_not_used(runs, resume, capsys):
     assert "resuming from step 128" in shown
 
 
+@pytest.mark.slow
 def test_without_one_of_its_own_the_run_is_refused(runs, resume):
     run, other = runs
     shutil.rmtree(run.checkpoints()[0].parent)

@@ -60,6 +60,7 @@ def learn(rollouts: OffPolicyRollouts, steps: int):
     return rollouts.model
 
 
+@pytest.mark.slow_except("sac-Plane")
 @pytest.mark.parametrize(
     ("algo", "env"),
     [("sac", "Plane"), ("td3", "Plane"), ("ddpg", "Plane"), ("tqc", "Plane"), ("dqn", "Corridor")],
@@ -117,6 +118,7 @@ def test_a_new_stage_leaves_no_episode_behind_that_spans_it(build):
         assert buffer.dones[:23, env].tolist() == buffer.timeouts[:23, env].tolist()
 
 
+@pytest.mark.slow
 def test_a_curriculum_in_hindsight(train):
     stages = [
         {"task": {"tolerance": 4.0}, "promote": {"success": 1.0, "window": 4, "min_steps": 112}},
@@ -147,6 +149,7 @@ def test_learning_starts_by_which_every_first_episode_is_over():
     assert replay_arguments(recipe, recipe.her, goals(max_steps=None))["learning_starts"] == 100
 
 
+@pytest.mark.slow_except("Line-settings4-False-None")
 @pytest.mark.parametrize(
     ("env", "settings", "check", "expected"),
     [
@@ -184,6 +187,7 @@ def goals(max_steps=None) -> EnvInfo:
     )
 
 
+@pytest.mark.slow
 def test_a_task_that_computes_rewards(tmp_path):
     settings = {**SMALL_HER, "n_envs": 2, "total_timesteps": 110, "algo_kwargs": {"batch_size": 16}, "task": {}}
     run = run_training(TrainRequest(f"{tasks.__file__}:Place", settings=settings, root=tmp_path, check=False)).run
@@ -279,6 +283,7 @@ def test_a_buffer_without_room_for_an_episode_ends_a_run(train, tmp_path):
     assert json.loads(status.read_text())["status"] == "failed"
 
 
+@pytest.mark.slow
 def test_a_fault_in_compute_reward_is_named_and_leaves_a_run(train, tmp_path):
     with pytest.raises(TaskError, match=r"compute_reward raised RuntimeError: goals have gone") as caught:
         train("Plane", {**SMALL_HER, "task": {"steps": 10, "fault": "raise"}})

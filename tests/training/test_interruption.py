@@ -76,6 +76,7 @@ def start(tmp_path):
         process.wait()
 
 
+# Takes seconds, and runs in every `make test`: signals, their exit codes, no process left.
 @pytest.mark.parametrize(
     ("number", "code"),
     [
@@ -190,6 +191,7 @@ def test_a_full_disk_costs_warnings_and_an_exit_code(start, rlctl, small_disk):
     assert "Traceback" not in stderr
 
 
+@pytest.mark.slow
 def test_a_reader_that_leaves_interrupts_the_training(start, tmp_path):
     """As `rlctl train ... 2>&1 | head -1` does."""
     read_end, write_end = os.pipe()
@@ -204,6 +206,7 @@ def test_a_reader_that_leaves_interrupts_the_training(start, tmp_path):
     assert list(run.glob("checkpoints/0*"))
 
 
+@pytest.mark.slow
 def test_stdout_closed_early_is_silent(start, tmp_path):
     read_end, write_end = os.pipe()
     os.close(read_end)
@@ -215,6 +218,7 @@ def test_stdout_closed_early_is_silent(start, tmp_path):
     assert "error" not in stderr
 
 
+@pytest.mark.slow
 def test_what_a_plugin_prints_stays_out_of_the_result(rlctl, tmp_path):
     (tmp_path / "chatty.py").write_text(
         f"import sys; sys.path.append({str(ENVS.parent)!r}); print('hello from the import')\n"

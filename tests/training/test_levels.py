@@ -40,6 +40,7 @@ def test_a_level_follows_success():
     assert rule.follow(0.05, False) == 0.0
 
 
+@pytest.mark.slow_except("tests.training.levelled:Levelled")
 @pytest.mark.parametrize("task", [TASK, BATCH])
 def test_what_is_mastered_gets_harder(train, task):
     # An episode takes 5 steps and succeeds up to level 0.6: 0, 0.25, 0.5, 0.75, then 0.65, then 0.55, 0.8 ..
@@ -55,6 +56,7 @@ def test_what_is_mastered_gets_harder(train, task):
     assert first.observations[0, 0] == 1.0  # what the task observes is its level
 
 
+@pytest.mark.slow
 def test_a_task_chooses_the_levels_of_its_episodes(train):
     run = train("tests.training.levelled:ChoosingBatch", following(start=0.5), envs="").run
     with run.metrics_file.open() as file:
@@ -63,6 +65,7 @@ def test_a_task_chooses_the_levels_of_its_episodes(train):
     assert [float(row["level"]) for row in rows] == [0.0625, 0.0078]
 
 
+@pytest.mark.slow
 def test_the_table_has_levels_if_a_later_stage_has(train):
     always = {"level": 0.2, "promote": {"return": -1000.0, "window": 1}}
     settings = {**SMALL, "stages": [always, {"level": {"start": 0.4, "up": 0.1}}]}
@@ -73,6 +76,7 @@ def test_the_table_has_levels_if_a_later_stage_has(train):
     assert rows[-1][1] >= 0.4
 
 
+@pytest.mark.slow
 def test_the_episode_that_failed_is_reproduced_at_its_level(train, tmp_path):
     settings = {**following(), "task": {"faulty_level": 0.5}}
     with pytest.raises(TaskError, match=BROKEN):
@@ -103,6 +107,7 @@ def test_what_is_not_supported_is_refused(train, task, settings, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [TASK, BATCH])
 def test_a_level_is_for_training_only(train, task):
     run = train(task, {**SMALL, "stages": [{"level": 0.4}]}, envs="").run

@@ -57,6 +57,7 @@ def test_first_episodes_are_short_and_no_results(make):
     assert counted == every - {(world, int(segment.done[world].argmax())) for world in range(COUNT)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_workers", [2, 3])
 def test_equal_in_any_number_of_workers_and_after_a_resume(make, n_workers):
     whole, resumed = make(), make(n_workers)

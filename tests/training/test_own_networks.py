@@ -41,6 +41,7 @@ TINY = {
 }
 
 
+@pytest.mark.slow_except("recurrent_ppo-vector-box-own6")
 @pytest.mark.parametrize(
     ("algo", "observation", "action", "own"),
     [
@@ -103,6 +104,7 @@ def test_whole_way_of_a_policy(trained, train, tmp_path):
     assert all((after[name] == before[name]).all() for name in before)
 
 
+@pytest.mark.slow
 def test_resume_is_exact(trained, train, resume):
     whole = train("Line", {**trained.recipe.model_dump(by_alias=True), "total_timesteps": 256})
     resumed = resume(trained, total_timesteps=256)
@@ -113,6 +115,7 @@ def test_resume_is_exact(trained, train, resume):
         np.testing.assert_array_equal(values, theirs[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_policy_file_alone_imports_nothing(trained, tmp_path, monkeypatch):
     file, nets = tmp_path / "policy.safetensors", tmp_path / "nets.py"
     shutil.copy(NETS, nets)
@@ -132,6 +135,7 @@ def test_a_policy_file_alone_imports_nothing(trained, tmp_path, monkeypatch):
         TorchActor.load(file)
 
 
+@pytest.mark.slow
 def test_a_policy_is_replayed_without_its_module(train, tmp_path):
     nets = tmp_path / "gone.py"
     shutil.copy(NETS, nets)
@@ -142,6 +146,7 @@ def test_a_policy_is_replayed_without_its_module(train, tmp_path):
     run_replay(ReplayRequest(None, verify=episode.episode)).check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("key", "name"), [("features_extractor_class", "Gated"), ("policy_class", "OwnActorCritic")])
 def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path, key, name):
     nets = tmp_path / "changing.py"
@@ -183,6 +188,7 @@ OWN_POLICIES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "algo", ["ppo", *(pytest.param(algo, marks=pytest.mark.slow) for algo in ("sac", "td3", "dqn", "recurrent_ppo"))]
 )

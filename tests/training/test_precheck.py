@@ -39,6 +39,7 @@ def test_without_the_check_it_trains(train, runs, small_ppo):
     assert len(runs()) == 1
 
 
+@pytest.mark.slow
 def test_warnings_are_printed_and_training_goes_on(train, small_ppo, capsys):
     assert train("LargeRewards", small_ppo, check=True).steps == 256
     printed = capsys.readouterr().err

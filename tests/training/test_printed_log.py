@@ -1,5 +1,7 @@
 """What environments print during a training: once on stderr with a count, all of it in the run folder."""
 
+import pytest
+
 SLIDER = """
     import gymnasium, numpy as np
     from .limits import REACH
@@ -24,6 +26,7 @@ SLIDER = """
 """
 
 
+@pytest.mark.slow
 def test_the_prints_of_many_environments(rlctl, write_module, tmp_path):
     write_module("robots/__init__.py", "")
     write_module("robots/limits.py", "REACH = 1.0\n")

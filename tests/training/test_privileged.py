@@ -99,6 +99,7 @@ def test_the_number_of_workers_changes_nothing(train, use_cores):
         assert_same_run(one, train(STOOL, SMALL, envs="").run)
 
 
+@pytest.mark.slow
 def test_only_the_actor_is_exported(train, tmp_path):
     run = train(STOOL, SMALL, envs="").run
     policy = PolicyFile.read(run.last_policy)

@@ -32,6 +32,7 @@ def test_recipe_errors_name_the_key(train, small_ppo, settings, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_a_reward_weight_of_the_other_sign_is_warned_of(train, small_ppo, capsys):
     stages = [{"reward_weights": {"distance": 2.0}, "promote": {"return": 0.0}}, {"reward_weights": {"distance": -0.5}}]
     train("reach", recipes.merge(small_ppo, {"stages": stages}))

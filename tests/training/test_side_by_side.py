@@ -13,6 +13,7 @@ from tests.training.comparing import assert_same_run
 from tests.training.conftest import ENVS, TINY
 
 
+@pytest.mark.slow
 def test_in_a_thread_a_training_is_the_same(train):
     """There are no signal handlers there, and the caller's own are left alone."""
     whole = train("Line", TINY).run
@@ -55,6 +56,7 @@ def test_two_processes_that_begin_the_same_run_at_once(tmp_path):
     assert latest in [(tmp_path / each["run"]).resolve() for each in (one, other)]
 
 
+@pytest.mark.slow
 def test_a_run_that_another_process_writes(train, resume):
     run = train("Line", TINY).run
     with (

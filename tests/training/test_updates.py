@@ -244,6 +244,16 @@ OFF_POLICY_CASES |= {
 }
 
 
+@pytest.mark.slow_except(
+    "dict, normalized",
+    "gSDE",
+    "fixed entropy coefficient, three critics",
+    "several steps",
+    "tqc",
+    "crossq",
+    "td3",
+    "dqn",
+)
 @pytest.mark.parametrize("name", OFF_POLICY_CASES)
 def test_off_policy_updates_as_sb3(name):
     update, algorithm, case = OFF_POLICY_CASES[name]
@@ -269,6 +279,7 @@ def test_off_policy_updates_as_sb3(name):
 WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
 
 
+@pytest.mark.slow_except("PPO", "TD3")
 @pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3, CrossQ])
 def test_wide_networks_are_updated_on_all_cores_to_the_same_bit(algorithm, use_cores):
     def train():

@@ -28,6 +28,7 @@ def assert_same_but_for_first_observations(begun, before):
         np.testing.assert_allclose(begun[name], values, rtol=0.0, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_begins_where_a_policy_ended(source, train, capfd):
     run = train("Line", {**TINY, "seed": 5}, initial_policy=str(source.path)).run
     policy = PolicyFile.read(source.best_policy)
@@ -109,6 +110,7 @@ def test_what_is_no_source(train, resume, source):
         run_training(TrainRequest(resume=str(source.path), initial_policy="reach", check=False))
 
 
+@pytest.mark.slow
 def test_the_warm_up_of_an_off_policy_algorithm_is_played_by_the_policy(train):
     sac = {"n_envs": 1, "total_timesteps": 40, "algo": "sac", "eval": {"episodes": 1, "every_steps": 1_000_000}}
     sac |= {"algo_kwargs": {"learning_starts": 30, "batch_size": 8}, "policy_kwargs": {"net_arch": [8]}}

@@ -93,6 +93,7 @@ def resume(folder, jobs=None):
     return tune(TuneRequest(resume=str(folder)), jobs=jobs)
 
 
+@pytest.mark.slow
 def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
     tuning = begin(tmp_path, RATES, trials=12)
     rates = [each.values["algo_kwargs.learning_rate"] for each in tuning.trials[1:]]
@@ -131,6 +132,7 @@ def test_only_the_first_trial_checks_the_environment(played, tmp_path):
     assert [(call.check, call.settings["seed"]) for call in played.calls] == [(True, 0), (False, 1), (False, 2)]
 
 
+@pytest.mark.slow
 def test_a_step_keeps_what_the_one_before_found(played, tmp_path):
     tuning = begin(tmp_path, trials=4)
     by_step = {number: [each for each in tuning.trials if each.step == number] for number in range(4)}
@@ -150,6 +152,7 @@ def test_no_choice_is_tried_twice(played, tmp_path):
     assert tuning.best.values == {"algo_kwargs.gamma": 0.98}
 
 
+@pytest.mark.slow
 def test_a_trial_that_falls_behind_is_stopped_and_its_checkpoints_go(played, tmp_path, capsys):
     tuning = begin(tmp_path, RATES, trials=12)
     pruned = [each for each in tuning.trials if each.state == "pruned"]
@@ -162,6 +165,7 @@ def test_a_trial_that_falls_behind_is_stopped_and_its_checkpoints_go(played, tmp
     assert not list(tuning.path.glob("*/checkpoints"))
 
 
+@pytest.mark.slow
 def test_a_trial_that_fails_stops_no_other(played, tmp_path, rlctl):
     played.fails = lambda settings: settings.get("algo_kwargs", {}).get("learning_rate", 0) > 1e-3
     tuning = begin(tmp_path, RATES, trials=8)
@@ -189,6 +193,7 @@ def test_a_task_without_success_is_refused_at_its_first_evaluation(played, tmp_p
     assert "trial 0: stopped: no success\n" in capsys.readouterr().err
 
 
+@pytest.mark.slow_except("1")
 @pytest.mark.parametrize("interrupted_at", [1, 3])
 def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     played.interrupts_at = interrupted_at
@@ -205,6 +210,7 @@ def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     assert again == tuning
 
 
+@pytest.mark.slow_except("1")
 @pytest.mark.parametrize("killed_at", [1, 3])
 def test_a_trial_that_was_killed_is_tried_again(played, tmp_path, killed_at):
     played.killed_at = killed_at
@@ -254,6 +260,7 @@ def test_tuners_share_a_storage_and_nothing_is_lost_on_resume(played, tmp_path):
     assert sorted(trial.user_attrs["trial"] for trial in ended) == sorted(labels)
 
 
+@pytest.mark.slow
 def test_a_storage_that_cannot_be_opened(tmp_path):
     with pytest.raises(UsageError, match="--storage nothing://x: cannot be opened"):
         begin(tmp_path, RATES, storage="nothing://x")

@@ -28,6 +28,7 @@ def diagnose(doctor, robot, *wrongs, seconds=4.0, seed=5, randomized=False):
     return doctor.diagnose(LoggedSignals(log.observations, log.actions, log.lengths, log.sizes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("randomized", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_sound_log_has_no_finding(doctor, robot, randomized):
     findings, answers, mapping = diagnose(doctor, robot, randomized=randomized)
@@ -44,6 +45,7 @@ def test_a_swap_in_the_closed_loop(doctor, robot):
     assert mapping.observations["joint_velocities"].order == list(SWAPPED)
 
 
+@pytest.mark.slow
 def test_a_swap_in_the_log_alone_is_found_with_the_policy(doctor, robot):
     findings, answers, mapping = diagnose(doctor, robot, Wrong("joint_velocities", "swap", order=SWAPPED, in_log=True))
     assert findings[0].text.startswith("joint_velocities: elements 3 and 4 are swapped (in the log")

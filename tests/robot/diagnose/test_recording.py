@@ -28,6 +28,7 @@ def write_recording(file, clients):
     return file
 
 
+@pytest.mark.slow
 def test_rows_client_by_client(tmp_path):
     rows = {3: [(1, [0.1], [1.0, 2.0]), (1, [0.2], None), (2, [0.3], [3.0, 4.0])], 12: [(0, [0.4], [5.0, 6.0])]}
     table = read_recording(write_recording(tmp_path / "served.rrd", rows))

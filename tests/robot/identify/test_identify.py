@@ -80,6 +80,7 @@ def test_trajectories_that_cannot_be(tmp_path, monkeypatch):
         write_excitation(SPEC, tmp_path / "log.csv", seconds=1.0, seed=0)
 
 
+@pytest.mark.slow
 def test_hidden_values_are_found(real, tmp_path):
     found = identify(SPEC, real, events=["mass", "late"], n_workers=1)
     (mass,) = found.values

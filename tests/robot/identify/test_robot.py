@@ -140,6 +140,7 @@ def test_a_delay_between_physics_steps_moves_the_commands(recorded):
     assert commands == pytest.approx([9.0, 0.4 * 9 + 0.6 * 10, 10.0, 10.0])
 
 
+@pytest.mark.slow
 def test_a_joint_that_does_not_move_is_named(recorded, write):
     robot, targets, _ = recorded
     commanded = targets * [1, 0]
@@ -156,6 +157,7 @@ def test_a_joint_that_does_not_move_is_named(recorded, write):
         identify_robot(str(ROBOT), write(commanded * 0, still * 0))
 
 
+@pytest.mark.slow
 def test_a_value_without_a_trace_is_unknown(tmp_path):
     # Around a vertical axis there is no gravity: the inertia alone tells the stiffness, the bias has no effect.
     text = ROBOT.read_text().replace('axis="0 1 0"', 'axis="0 0 1"').replace("-0.05 0 0 -0.35", "0 0.3 0 0")
@@ -276,6 +278,7 @@ def test_a_log_of_some_joints_locks_the_others(recorded, tmp_path):
     assert alone.notes == (f"{ROBOT}: not in the log, so locked: shoulder",)
 
 
+@pytest.mark.slow
 def test_excitation_moves_each_joint_alone_and_keeps_the_limits(tmp_path):
     found = write_robot_excitation(str(ROBOT), tmp_path / "chirp.csv", seconds=20.0, rate=50.0, seed=0, threads=1)
     motion = read_motion(found.path, ["shoulder", "elbow"])
@@ -289,6 +292,7 @@ def test_excitation_moves_each_joint_alone_and_keeps_the_limits(tmp_path):
         write_robot_excitation(str(ROBOT), tmp_path / "chirp.csv", seconds=5.0, rate=50.0, seed=0)
 
 
+@pytest.mark.slow
 def test_excitation_without_a_safe_motion_names_the_links(tmp_path):
     wall = '<body name="wall" pos="0.22 0 0.7"><geom type="box" size="0.12 1 1"/></body></worldbody>'
     path = tmp_path / "caged.xml"
@@ -307,6 +311,7 @@ def test_a_robot_without_servos_needs_the_stiffness(write, tmp_path):
         identify_robot(str(path), write(), fit=["stifness"])
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_explain_the_log_has_no_values(recorded, write):
     noise = np.random.default_rng(0).normal(size=recorded[1].shape).cumsum(axis=0) * 0.03
     with pytest.raises(AnswerIsNo, match=r"two_servos\.xml does not explain this log"):
@@ -330,6 +335,7 @@ def test_the_written_model_moves_as_the_robot_did(identified, recorded):
     assert np.abs(np.array(read) - positions[:400]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_commands(rlctl, small_log, tmp_path):
     found = rlctl("identify", ROBOT, "--log", small_log, "--fit", "coulomb", "--fit", "delay", "-o", tmp_path / "out")
     assert found.returncode == 0, found.stderr

@@ -71,6 +71,7 @@ def fit(env, log: Log) -> tuple[IdentifiedValue, Fit]:
     return _estimate_values(unknowns, best)[0], best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", [pytest.param(1.0, marks=pytest.mark.slow), 1.4])
 def test_the_mass_is_found_wherever_the_robot_starts(mass, env, log):
     found, best = fit(env, play(env, log, mass))

@@ -259,6 +259,7 @@ def test_actions_beyond_their_bounds_are_clipped():
     assert report.scores[0].episodes[0].total_reward == pytest.approx(-20.0)
 
 
+@pytest.mark.slow
 def test_a_program_that_answers_twice_or_not_at_all():
     report = play(control_by_udp, step_down, options={"repeats": 2})
     assert report.scores[0].commands.held == 0
@@ -295,6 +296,7 @@ def test_real_time():
     assert len(score.commands.robot_late_s) == 10
 
 
+@pytest.mark.slow
 def test_a_program_that_goes_away_in_real_time():
     answers = iter([step_down] * 7)  # it is gone in the second episode, whose 0.5 s are shorter than the timeout
     report = play(control_by_udp, lambda values: next(answers, lambda values: None)(values), episodes=9, realtime=True,
@@ -303,6 +305,7 @@ def test_a_program_that_goes_away_in_real_time():
         report.check(NO_GATES)
 
 
+@pytest.mark.slow
 def test_a_simulation_that_is_slower_than_the_clock():
     report = play(
         control_by_udp, step_down, task=f"{Path(__file__).with_name('slow.py')}:SlowSlider", episodes=1, realtime=True
@@ -334,6 +337,7 @@ def test_who_may_control_it(tmp_path):
     start.join()
 
 
+@pytest.mark.slow
 def test_clients_that_are_none_do_not_lock_a_program_out():
     def control(port, act):
         with contextlib.ExitStack() as stack:

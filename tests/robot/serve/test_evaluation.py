@@ -43,6 +43,7 @@ def evaluate(tmp_path, text, **options):
     return run_evaluation(request)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_what_limits_cost(tmp_path):
     result = evaluate(tmp_path, STEP + "limits: {all: {speed: 0.02}}")  # [rad/s]: it gets nowhere
@@ -56,6 +57,7 @@ def test_what_limits_cost(tmp_path):
     assert content["interventions"] == counts
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path):
     def print_with(text):
@@ -67,6 +69,7 @@ def test_a_wrong_scale_is_noticed_by_how_far_the_joints_move(tmp_path):
     assert "as far as commanded" not in print_with(STEP)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_limits_that_never_step_in_cost_nothing(tmp_path):
     result = evaluate(tmp_path, STEP + "limits: {all: {speed: 100, position: [-9, 9]}}")
@@ -81,6 +84,7 @@ def test_limits_that_the_task_cannot_have(tmp_path):
         evaluate(tmp_path, "sensors: {joints: {range: [0, 1]}}")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_through_a_server_it_is_the_same(reach_server):
     direct = run_evaluation(EvalRequest("reach", checkpoint=PRETRAINED, episodes=2, n_envs=1))
@@ -91,6 +95,7 @@ def test_through_a_server_it_is_the_same(reach_server):
     assert len(served.played[0].result.report["round_trips_s"]) == served.played[0].result.length
 
 
+@pytest.mark.slow
 def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
     reach_server.post("/stop")
     try:
@@ -149,6 +154,7 @@ def serve_answer(metadata, answer):
     loop.close()
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_self_test(tmp_path):
     from rlctl.runs.lookup import find_policy

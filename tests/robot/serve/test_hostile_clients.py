@@ -156,6 +156,7 @@ def test_a_stop_is_served_with_few_file_descriptors_and_many_connections(tmp_pat
         process.kill()
 
 
+@pytest.mark.slow
 def test_too_few_file_descriptors(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     command = f"ulimit -n 128; exec {sys.executable} -m rlctl serve {file} --port 0"
@@ -172,6 +173,7 @@ def test_addresses_that_are_none(server, headers, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_compressed_body_is_refused_before_it_is_unpacked(server):
     body = gzip.compress(bytes(200_000_000))
     began = time.process_time()

@@ -80,6 +80,7 @@ def test_without_the_extra(rlctl, tmp_path, options):
     assert "rlctl serve needs aiohttp: pip install 'rlctl[serve]'\n" in done.stderr
 
 
+@pytest.mark.slow
 def test_starts_without_what_takes_long_to_import(tmp_path):
     file = write_policy(tmp_path / "policy.safetensors")
     code = (
