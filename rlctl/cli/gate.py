@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from rlctl.arguments import choose_checkpoint, command_in_panels, parse_changes
+from rlctl.errors import UsageError
 from rlctl.evaluation.eval_request import MinReturn, MinSuccess, MinSuccessLower
 from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrained, RunName, Settings, SimOption
 
@@ -13,7 +14,7 @@ from rlctl.options import Checkpoint, EpisodeSeed, Json, Junit, Option, Pretrain
 @command_in_panels(
     {
         "Options": ["task", "checkpoint", "pretrained", "episodes", "seed", "settings", "sim"],
-        "Check": ["strict", "budget"],
+        "Check": ["no_check", "strict", "budget"],
         "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
         "Comparison": ["against", "margin", "allow_no_success"],
         "Output": ["export", "json", "junit", "sarif", "markdown"],
@@ -28,6 +29,7 @@ def gate(
     seed: EpisodeSeed = 0,
     settings: Settings = [],
     sim: SimOption = None,
+    no_check: Annotated[bool, Option("Leave out the check of the environment.", ("--no-check",))] = False,
     strict: Annotated[bool, Option("Warnings of the check fail too.", ("--strict",))] = False,
     budget: Annotated[
         float | None,
@@ -63,6 +65,10 @@ def gate(
     from rlctl.gating.gate import GateRequest, run_gate
     from rlctl.gating.report import show, show_step
 
+    if no_check:
+        for name, value in (("--strict", strict), ("--budget", budget), ("--sarif", sarif)):
+            if value:
+                raise UsageError(f"{name} is for the check, which --no-check leaves out")
     evaluation = EvalRequest(
         run,
         task=task,
@@ -81,6 +87,7 @@ def gate(
         export=export,
         strict=strict,
         budget_s=budget,
+        checks=not no_check,
     )
     report = run_gate(request, show_step, quiet=json == "-")
     show(report, json, junit, sarif, markdown)

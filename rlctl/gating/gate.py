@@ -37,10 +37,14 @@ class GateRequest:
     export: Path | None = None  # file to write, .onnx or .c; None: nothing is exported
     strict: bool = False  # whether warnings of the check fail
     budget_s: float | None = None  # of each process of the check; None: as much as `check-env` takes
+    checks: bool = True  # whether the environment is checked
 
     def __post_init__(self) -> None:
-        if self.gates == NO_GATES:
-            raise UsageError("gate: say what the policy must reach, e.g. --min-success-lower 0.9, or --min-return 100")
+        if self.gates == NO_GATES and self.against is None:
+            raise UsageError(
+                "gate: say what the policy must reach, e.g. --min-success-lower 0.9, or --min-return 100; "
+                "or with --against FILE which policy it must not be worse than"
+            )
         if self.margin is not None and self.against is None:
             raise UsageError("--margin: with what is it compared? Add --against FILE.safetensors")
         if self.export is not None and self.export.suffix not in (".onnx", ".c"):
@@ -121,7 +125,12 @@ def run_gate(request: GateRequest, show: Callable[[object], None], *, quiet: boo
         pinned = dataclasses.replace(request.evaluation, run=str(source.run.path))
         request = dataclasses.replace(request, evaluation=pinned)
     found = _Findings(request, source, spec, (lambda result: None) if quiet else show)
-    steps = [found.take("check", found.check), found.take("eval", found.play)]
+    steps = []
+    if request.checks:
+        steps.append(found.take("check", found.check))
+    else:
+        steps.append(GateStep("check", Result.SKIPPED, "left out: --no-check"))
+    steps.append(found.take("eval", found.play))
     if request.against is None:
         steps.append(GateStep("compare", Result.SKIPPED, "nothing to compare with: --against FILE"))
     else:

@@ -295,11 +295,22 @@ def _explain(problem: Any, path: Sequence[str | int], schema: validation.Schema,
 
 
 def find_difference(recipe: Recipe, base: Recipe) -> dict[str, tuple[Any, Any]]:
-    """Return the dotted keys that differ except `seed` and `track`, each with its value in `recipe` and in `base`."""
+    """Return the dotted keys that differ except `seed` and `track`, each with its value in `recipe` and in `base`.
+
+    A hyperparameter that is not set has its default.
+    """
     ours, theirs = (dict(flatten(one.model_dump(mode="json", by_alias=True))) for one in (recipe, base))
-    keys = dict.fromkeys([*theirs, *ours])
-    pairs = {key: (ours.get(key, NOT_SET), theirs.get(key, NOT_SET)) for key in keys if key not in ("seed", "track")}
+    keys = [key for key in dict.fromkeys([*theirs, *ours]) if key not in ("seed", "track")]
+    pairs = {key: (_find_effective(recipe, ours, key), _find_effective(base, theirs, key)) for key in keys}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def _find_effective(recipe: Recipe, values: Mapping[str, Any], key: str) -> Any:
+    section, _, name = key.partition(".")
+    if key in values or section != "algo_kwargs":
+        return values.get(key, NOT_SET)
+    field = ALGORITHM_PARAMETERS[recipe.algo].model_fields.get(name)
+    return NOT_SET if field is None else field.default
 
 
 def find_mixed(recipes: Sequence[Recipe]) -> list[str]:

@@ -62,6 +62,16 @@ def test_a_gate_that_could_not_say_no_is_refused(options, message):
         GateRequest(**{"evaluation": EvalRequest("x"), "gates": Gates(min_success=0.9), **options})
 
 
+def test_a_comparison_is_enough():
+    GateRequest(EvalRequest("x"), NO_GATES, against=Path("used.safetensors"))
+
+
+def test_options_of_the_check_need_the_check(rlctl):
+    done = rlctl("gate", "x.safetensors", "--min-success", 0.5, "--no-check", "--sarif", "gate.sarif")
+    assert done.returncode == UsageError.exit_code
+    assert done.stderr == "error: --sarif is for the check, which --no-check leaves out\n"
+
+
 def test_without_a_policy_the_files_say_so(rlctl, tmp_path):
     files = ("--json", "gate.json", "--junit", "gate.xml", "--sarif", "gate.sarif", "--markdown", "gate.md")
     done = rlctl("gate", "nothing.onnx", "--min-success", 0.5, *files)
@@ -90,3 +100,6 @@ def test_all_steps_of_a_policy(rlctl, block_run, tmp_path):  # noqa: F811
     assert not (tmp_path / "policy.onnx").exists()
     assert json.loads((tmp_path / "gate.sarif").read_text())["runs"][0]["results"]
     assert (tmp_path / "gate.md").read_text().startswith("**rlctl gate not passed")
+    done = rlctl("gate", block_run.path, "--no-check", *options[:4], "--set", "randomize=false", "--json", "gate.json")
+    results = [step["result"] for step in json.loads((tmp_path / "gate.json").read_text())["steps"]]
+    assert (results, done.returncode) == (["skipped", "passed", "passed", "skipped"], 0)

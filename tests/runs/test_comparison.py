@@ -13,8 +13,9 @@ from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.players import choose_spec, load_player
 from rlctl.launching.train import run_training
+from rlctl.recipe.recipe import find_difference
 from rlctl.recipe.sources import resolve
-from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare, find_recipe_changes
+from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare
 from rlctl.runs.compare.margin import check_margin
 from rlctl.runs.compare.report import as_json, describe_candidate, format_needed, make_suite
 from rlctl.runs.compare.significance import Verdict
@@ -257,8 +258,8 @@ def test_a_parameter_that_is_not_set_has_its_default():
     higher = resolve("ant", None, {"algo": "sac", "algo_kwargs": {"learning_rate": 0.002}})
     unset = resolve("ant", None, {"algo": "sac"})
     same = resolve("ant", None, {"algo": "sac", "algo_kwargs": {"learning_rate": 0.0003}})
-    assert find_recipe_changes(higher, unset) == {"algo_kwargs.learning_rate": (0.002, 0.0003)}
-    assert find_recipe_changes(same, unset) == {}
+    assert find_difference(higher, unset) == {"algo_kwargs.learning_rate": (0.002, 0.0003)}
+    assert find_difference(same, unset) == {}
 
 
 def test_a_report_of_two_recipes_begins_with_the_verdict(root):

@@ -362,6 +362,29 @@ def test_advice_has_the_recipes_value_beside_the_usual_ones(write_training):
     assert settings["clip_range"].value == 0.2  # SB3's default
 
 
+def test_the_value_that_is_far_out_of_its_range_comes_first(write_training):
+    recipe = {"algo_kwargs": {"learning_rate": "lin_0.03", "clip_range": 0.3, "n_epochs": 8}}
+    run = write_training({**FLAT, "approx_kl": 0.6, "clip_fraction": 0.7}, recipe=recipe)
+    (finding,) = (each for each in diagnose(run) if each.id == "Q3")
+    assert finding.settings[0].name == "learning_rate"
+    assert finding.settings[0].advice.startswith("30 times out of its usual range; usually 1e-5 to 1e-3")
+    assert not any("out of its usual range" in setting.advice for setting in finding.settings[1:])
+
+
+LARGE = {"approx_kl": 0.15, "clip_fraction": 0.5}
+
+
+def test_a_learning_rate_far_above_the_usual_is_a_warning_though_it_learns(write_training):
+    (finding,) = diagnose(write_training(LARGE, recipe={"algo_kwargs": {"learning_rate": 0.03}}))
+    assert (finding.id, finding.name, finding.grade) == ("Q3", "the learning rate is very high", Grade.WARNING)
+    assert finding.evidence[-1] == "learning rate 0.03"
+
+
+@pytest.mark.parametrize(("metrics", "rate"), [({}, 0.03), (LARGE, 0.009)])
+def test_a_high_learning_rate_or_large_updates_alone_are_no_finding(write_training, metrics, rate):
+    assert diagnose(write_training(metrics, recipe={"algo_kwargs": {"learning_rate": rate}})) == []
+
+
 def test_advice_names_no_parameter_that_the_algorithm_does_not_have(write_training):
     collapsed = {"return": np.concatenate([RISING[:15], np.full(15, -45.0)]), "success": None}
     finding = next(each for each in diagnose(write_training(collapsed, recipe={"algo": "sac"})) if each.id == "Q11")

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, UsageError, check_name
-from rlctl.task.model_files import find_model_file
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression, differentiate
 from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise
@@ -28,6 +27,7 @@ from rlctl_robot.identify.robot_model import (
     VISCOUS,
     RobotModel,
     Values,
+    find_robot,
     list_servo_joints,
     read_robot,
     stack_values,
@@ -119,7 +119,7 @@ def identify_robot(
     chosen = tuple(fit) or DEFAULT
     for name in chosen:
         check_name(name, QUANTITIES, "--fit: no quantity", UsageError)
-    path = find_model_file(file)
+    path = find_robot(file)
     motion = read_motion(log, list_servo_joints(path), columns)
     robot = read_robot(path, motion.joints, timestep=timestep)
     check_positions(motion, robot)

@@ -8,7 +8,6 @@ import numpy as np
 
 from rlctl import output
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.task.model_files import find_model_file
 from rlctl.task.mujoco.world import import_mujoco
 from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.motion import write_motion
@@ -59,7 +58,7 @@ def write_robot_excitation(
     """
     if seconds < _SHORTEST_S:
         raise UsageError(f"--seconds {seconds:g}: the joints of a robot move one after the other; give 10 or more")
-    robot, solid = read_robot(find_model_file(file)), read_robot(find_model_file(file), collides=True)
+    robot, solid = read_robot(file), read_robot(file, collides=True)
     values = _guess_values(robot)
     reason = ""
     for amplitude in _AMPLITUDES:

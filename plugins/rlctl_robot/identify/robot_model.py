@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.errors import TaskError, UsageError, check_name
-from rlctl.task.model_files import find_model_file
+from rlctl.task.model_files import explain_missing, find_model_file
 from rlctl.task.mujoco.files import ModelFile, read_model_file
 from rlctl.task.mujoco.real_motors import insert_play, set_friction_impedance
 from rlctl.task.mujoco.world import import_mujoco
@@ -55,6 +55,14 @@ def is_model_file(name: str) -> bool:
     return name.endswith((".xml", ".urdf", ".xacro"))
 
 
+def find_robot(file: str | Path) -> Path:
+    """Return the path of a model file that the command line names; raises `UsageError` if there is none."""
+    try:
+        return find_model_file(file)
+    except TaskError:
+        raise UsageError(explain_missing(Path(file))) from None
+
+
 def list_servo_joints(path: Path) -> tuple[str, ...]:
     """Return the joints of a model file that a log may contain: those with actuators, or all if it has none."""
     spec = read_model_file(path, fixed=True, visuals=False).spec
@@ -89,7 +97,7 @@ def read_robot(
     servo with its encoder and the link. The physics step is `timestep` [s], or the file's. Raises `TaskError` for a
     file that cannot be read, `UsageError` for a joint that is not there.
     """
-    path = find_model_file(file)
+    path = find_robot(file)
     source = read_model_file(path, fixed=True, visuals=False)
     spec, mujoco = source.spec, import_mujoco()
     possible = list_servo_joints(path)

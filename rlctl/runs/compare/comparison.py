@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
-from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
-from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
+from rlctl.recipe.recipe import NOT_SET, find_difference, find_mixed
 from rlctl.runs.compare.margin import check_margin
 from rlctl.runs.compare.policy_alone import PolicyAlone, find_same_policy, reports_success
 from rlctl.runs.compare.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
@@ -226,7 +225,7 @@ def compare_runs(
             Candidate(
                 side,
                 _differences(baseline, side, of_recipes, len(others)),
-                find_recipe_changes(recipe[0], recipes[0][0]) | _find_other_starts(group[0], groups[0][0])
+                find_difference(recipe[0], recipes[0][0]) | _find_other_starts(group[0], groups[0][0])
                 if recipe and recipes[0]
                 else None,
                 twin,
@@ -238,27 +237,10 @@ def compare_runs(
     )
 
 
-def find_recipe_changes(recipe: Recipe, baseline: Recipe) -> dict[str, tuple[Any, Any]]:
-    """Return per dotted key that differs its value in `recipe` and in `baseline`; where it is not set, the default."""
-    changes = {
-        key: (_find_effective(recipe, key, value), _find_effective(baseline, key, before))
-        for key, (value, before) in find_difference(recipe, baseline).items()
-    }
-    return {key: pair for key, pair in changes.items() if pair[0] != pair[1]}
-
-
 def _find_other_starts(run: RunDirectory, baseline: RunDirectory) -> dict[str, tuple[Any, Any]]:
     """Return the policies that two trainings began with, under the name of the option, if they differ."""
     starts = [str((trained.status().get("from") or {}).get("policy", NOT_SET)) for trained in (run, baseline)]
     return {} if starts[0] == starts[1] else {"--from": (starts[0], starts[1])}
-
-
-def _find_effective(recipe: Recipe, key: str, value: Any) -> Any:
-    section, _, name = key.partition(".")
-    if value != NOT_SET or section != "algo_kwargs":
-        return value
-    field = ALGORITHM_PARAMETERS[recipe.algo].model_fields.get(name)
-    return value if field is None else field.default
 
 
 def _refuse_unequal(names: Sequence[str], groups: Sequence[Sequence[RunDirectory]]) -> None:

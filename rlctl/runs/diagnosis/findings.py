@@ -21,6 +21,8 @@ from rlctl.runs.diagnosis.history import RunHistory
 from rlctl.runs.directory import RunDirectory
 
 _NOT = "not "
+_FAR_OUT = 5.0
+"""Factor outside of its usual range from which a hyperparameter is the first suspect."""
 
 
 class Grade(enum.StrEnum):
@@ -105,17 +107,34 @@ def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history
         evidence=list(dict.fromkeys(sign for sign in evidence if sign is not None)),
         meaning=text["meaning"],
         advice=[advice.replace("RUN", str(history.run.path)).replace("TASK", task) for advice in text["try"]],
-        settings=list(_settings(text["settings"], history)),
+        settings=_settings(text["settings"], history),
     )
 
 
-def _settings(names: Iterable[str], history: RunHistory) -> Iterable[Setting]:
+def _settings(names: Iterable[str], history: RunHistory) -> list[Setting]:
+    """Return the hyperparameters that the algorithm has, those that are farthest out of their usual range first."""
+    settings = []
     for name in names:
         row = _texts()["settings"][name]
         if name not in history.parameters or (row.get("on_policy") and history.recipe.get("algo") not in ON_POLICY):
             continue
+        value = history.parameters[name]
+        factor = _count_times_out(value, row["range"])
         advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
-        yield Setting(name, history.parameters[name], advice)
+        if factor >= _FAR_OUT:
+            advice = f"{factor:.0f} times out of its usual range; {advice}"
+        settings.append((factor, Setting(name, value, advice)))
+    ordered = sorted(settings, key=lambda pair: -pair[0] if pair[0] >= _FAR_OUT else 0.0)
+    return [setting for _, setting in ordered]
+
+
+def _count_times_out(value: object, usual: str) -> float:
+    """Return by what factor a value is above or below the range `LOW to HIGH`; 1 inside."""
+    low, high = (float(end) for end in usual.split(" to "))
+    number = record_signs.read_first_value(value)
+    if number is None or number <= 0:
+        return 1.0
+    return max(1.0, number / high, low / number)
 
 
 def explain(code: str) -> list[str]:

@@ -10,6 +10,7 @@ from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import Recipe
 from rlctl.runs.diagnosis.history import FEW_ROWS, LEAST_ROWS, Curve, RunHistory
 
+_USUAL_RATE = 1e-3  # the most that is usual
 _MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
 
 
@@ -63,6 +64,26 @@ def policy_jumps(run: RunHistory) -> str | None:
     """Updates change the policy several times more than PPO intends."""
     change = _read_change(run)
     return change.describe() if change and (change.kl >= 0.2 or change.clipped >= 0.55) else None
+
+
+def updates_are_large(run: RunHistory) -> str | None:
+    """Updates change the policy more than PPO intends, though what was learned may survive them."""
+    change = _read_change(run)
+    return change.describe() if change and (change.kl >= 0.08 or change.clipped >= 0.45) else None
+
+
+def learning_rate_is_far_above(run: RunHistory) -> str | None:
+    """The learning rate is at least ten times the usual most."""
+    rate = read_first_value(run.parameters.get("learning_rate"))
+    return f"learning rate {rate:g}" if rate is not None and rate >= 10 * _USUAL_RATE else None
+
+
+def read_first_value(setting: object) -> float | None:
+    """Return the value of a hyperparameter at the beginning, also of a schedule such as `lin_3e-4`."""
+    try:
+        return float(str(setting).rpartition("_")[2])
+    except ValueError:
+        return None
 
 
 def policy_is_replaced(run: RunHistory) -> str | None:

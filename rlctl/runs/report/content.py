@@ -14,9 +14,8 @@ from rlctl.environments import installed
 from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
 from rlctl.output import format_duration
 from rlctl.play.episode import RecordedEpisode
-from rlctl.recipe.recipe import NOT_SET, Recipe
+from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference
 from rlctl.recipe.stages import format_value
-from rlctl.runs.compare.comparison import find_recipe_changes
 from rlctl.runs.diagnosis.findings import Finding
 from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
@@ -114,12 +113,12 @@ def _group_by_recipe(runs: Sequence[RunDescription], arguments: Mapping[Path, st
     groups: list[tuple[Recipe, list[RunDescription]]] = []
     for run in runs:
         recipe = run.run.recipe()
-        same = next((group for other, group in groups if not find_recipe_changes(recipe, other)), None)
+        same = next((group for other, group in groups if not find_difference(recipe, other)), None)
         if same is None:
             groups.append((recipe, [run]))
         else:
             same.append(run)
-    changes = [find_recipe_changes(recipe, groups[0][0]) for recipe, _ in groups]
+    changes = [find_difference(recipe, groups[0][0]) for recipe, _ in groups]
     baseline = {key: before for change in changes for key, (_, before) in change.items()}
     names = [_name_recipe(baseline | {key: value for key, (value, _) in change.items()}) for change in changes]
     labels = names
