@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rlctl.arguments import choose_checkpoint, command
+from rlctl.errors import ArtifactError
 from rlctl.options import Argument, Json, SimOption
 from rlctl_robot.diagnose.diagnose_request import DiagnoseRequest
 
@@ -34,6 +35,8 @@ def diagnose(
     from rlctl_robot.diagnose.report import show
     from rlctl_robot.diagnose.source import find_source
 
+    if log is not None and not log.exists():
+        raise ArtifactError(f"{log}: no such file or folder")
     source = find_source(
         request.policy, choose_checkpoint(request.checkpoint, request.pretrained), parse_changes([], sim)
     )

@@ -108,5 +108,6 @@ def test_the_command_line(tmp_path, robot, capsys):
     assert result["mapping"] == {"observations": {"joint_velocities": {"order": list(SWAPPED)}}}
 
 
-def test_a_missing_log_is_exit_code_5():
-    assert run(["diagnose", "no.csv", "--policy", "reach", "--pretrained"]) == 5
+def test_a_missing_log_is_said_before_a_missing_policy(capsys):
+    assert run(["diagnose", "no.csv", "--policy", "nothing"]) == 5
+    assert capsys.readouterr().err == "error: no.csv: no such file or folder\n"
