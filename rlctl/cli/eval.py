@@ -23,7 +23,7 @@ from rlctl.replaying.replay_request import ReplayRequest
         "Options": ["episodes", "seed", "checkpoint", "pretrained", "baseline", "task", "settings", "stage"],
         "Gates": ["min_success", "min_success_lower", "min_return", "decide_early"],
         "Robustness": ["vary", "push", "yes"],
-        "A policy of another project": ["deploy", "model", "terrain"],
+        "A policy of another project": ["deploy", "model", "terrain", "motion", "motion_rate"],
         "How": ["sim", "deterministic", "limits", "env_timeout_s"],
         "Where": ["n_envs", "on", "cluster"],
         "Output": ["record", "picture", "json", "junit"],
@@ -150,7 +150,7 @@ def _fill_counts(arguments: Iterable[str]) -> Iterator[str]:
     {
         "Options": ["baseline", "checkpoint", "pretrained", "task", "verify"],
         "Episodes": ["episodes", "worst", "best", "failures", "seed", "settings"],
-        "A policy of another project": ["deploy", "model", "terrain"],
+        "A policy of another project": ["deploy", "model", "terrain", "motion", "motion_rate"],
         "Where": ["gui", "sim"],
         "Output": ["output", "video", "seconds", "size", "camera", "json"],
     }

@@ -219,7 +219,7 @@ def new_task(
     json: Json = None,
 ) -> None:
     """Create a starter plugin in a folder NAME: a reach, walk, pick or motion task, its recipe, tests."""
-    from rlctl.tasks.clip_options import ClipOptions
+    from rlctl.task.clip_options import ClipOptions
     from rlctl.tasks.new import create, show
 
     hand = [name for name, asked in (("pick", pick), ("place", place), ("push", push)) if asked]

@@ -22,6 +22,7 @@ from rlctl.task.history import Start
 from rlctl.task.joints import Joints
 from rlctl.task.layout import Layout
 from rlctl.task.terms import (
+    ClipOrientation,
     Displacement,
     Distance,
     Euler,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from rlctl.task.worlds import TaskWorlds
 
 AnyTerm = Annotated[
-    Scaled | Gravity | Euler | Displacement | Distance | LastAction | PhaseClock | Playback,
+    Scaled | Gravity | Euler | Displacement | Distance | LastAction | PhaseClock | Playback | ClipOrientation,
     pydantic.Field(discriminator="kind"),
 ]
 _SHOWN_JOINTS = 8

@@ -18,7 +18,7 @@ from rlctl.policy.shipped import Provenance
 from rlctl.runs import lookup
 from rlctl.runs.lookup import FoundPolicy
 from rlctl.storage import validation
-from rlctl.task.deployment import TASK
+from rlctl.task.deployment import TASKS
 
 
 def export_actor(request: ExportRequest) -> PolicyFile:
@@ -52,7 +52,7 @@ def _find_origin(source: FoundPolicy) -> dict[str, Any]:
             "recipe": source.run.recipe().model_dump(mode="json", by_alias=True),
         }
     info = PolicyFile.read_info(source.file) if source.file.suffix == ".safetensors" else None
-    if info is not None and info.spec.task == TASK:
+    if info is not None and info.spec.task in TASKS:
         raise UsageError(
             f"{source.file}: an imported policy: the file itself is what to pass on, with its robot; "
             f"its score: rlctl eval {source.file} --json FILE"

@@ -24,9 +24,14 @@ Kind = Literal[
     "joint_velocities",
     "last_action",
     "phase",
+    "motion",
+    "anchor_orientation",
 ]
 TASK = "rlctl_locomotion.deployed:Deployed"
-"""The task that plays deployed policies."""
+"""The task that plays deployed policies which follow velocity commands."""
+MOTION_TASK = "rlctl_locomotion.deployed_motion:DeployedMotion"
+"""The task that plays those which follow a clip."""
+TASKS = (TASK, MOTION_TASK)
 NOT_TRAINED = (
     "an imported policy is not trained further: rlctl distill POLICY trains a student of it, "
     "rlctl tasks new NAME --model ROBOT makes a task of the robot to train"
@@ -35,6 +40,8 @@ NOT_TRAINED = (
 COMMANDS = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
 """What the observation `command` consists of [m/s, m/s, rad/s], in this order."""
 ORIENTATION = "orientation"  # the quantity from which gravity and Euler angles are computed
+MOTION = ("motion", "anchor_orientation")
+"""What is observed of a clip: joint positions and velocities, and the orientation of the link `anchor`."""
 _Number = Annotated[float, pydantic.AllowInfNan(False)]
 _Numbers = tuple[_Number, ...]
 _Factor = _Number | _Numbers
@@ -56,7 +63,7 @@ class ObservedPart(pydantic.BaseModel, extra="forbid", frozen=True):
 
 
 class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
-    """A deployed policy of a robot that follows velocity commands; values of joints are in the order of `joints`."""
+    """A deployed policy of a robot that follows velocity commands or a clip; values are in the order of `joints`."""
 
     joints: tuple[str, ...] = pydantic.Field(min_length=1)  # in the order of the action and of observations
     default_positions: _Numbers  # [rad]; the targets of action 0, and what relative positions are from
@@ -75,9 +82,10 @@ class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
     newest_first: bool = False
     history_start: Literal["first", "zeros"] = "first"
     """What fills histories when an episode begins."""
-    commands: Mapping[str, tuple[_Number, _Number]]
+    commands: Mapping[str, tuple[_Number, _Number]] = {}
     """Lowest and highest command by name, one of `COMMANDS` [m/s, m/s, rad/s]; one that is left out is 0."""
     start_height: float = pydantic.Field(gt=0)  # [m], of the trunk's centre of mass
+    anchor: str = ""  # link whose orientation a clip has; empty: the base
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> Self:
@@ -125,9 +133,18 @@ class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
         """Return the number of elements of one value of an observation."""
         if part.kind in ("joint_positions", "joint_velocities", "last_action"):
             return len(self.joints)
+        if part.kind == "motion":
+            return 2 * len(self.joints)
+        if part.kind == "anchor_orientation":
+            return 6
         if part.kind == "phase":
             return 2 * len(part.offsets)
         return 3
+
+    @property
+    def follows_motion(self) -> bool:
+        """Whether the policy observes a clip."""
+        return any(part.kind in MOTION for part in self.observations)
 
     @property
     def action_bounds(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

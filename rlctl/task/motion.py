@@ -23,6 +23,7 @@ ORIENTATION = ("root_qx", "root_qy", "root_qz", "root_qw")
 ROOT = (*POSITION, *ORIENTATION)
 _STEADY = 0.02  # of the time between two frames, by which it may vary
 _DECIMALS = 6
+_TIME_DIGITS = 9  # of times, which are read back as equal steps also after minutes
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,8 +123,10 @@ def find_rate(times: Any, where: str) -> float:
 
 def write_motion(motion: MotionClip) -> bytes:
     """Return a clip as the content of its file."""
-    columns = [np.arange(len(motion)) / motion.rate, *motion.root_position.T, *motion.root_orientation.T]
-    rows = np.column_stack([*columns, motion.joint_positions])
+    times = (np.arange(len(motion)) / motion.rate).tolist()
+    rows = np.column_stack([motion.root_position, motion.root_orientation, motion.joint_positions])
     lines = [",".join([TIME, *ROOT, *motion.joint_names])]
-    lines += [",".join(f"{value:.{_DECIMALS}g}" for value in row) for row in rows.tolist()]
+    for time, row in zip(times, rows.tolist(), strict=True):
+        numbers = [f"{value:.{_DECIMALS}g}" for value in row]
+        lines.append(",".join([f"{time:.{_TIME_DIGITS}g}", *numbers]))
     return ("\n".join(lines) + "\n").encode()

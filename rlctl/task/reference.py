@@ -72,6 +72,8 @@ class Reference:
         self.turning = rotate_inverse(self.orientation, self.angular_velocity)  # in the frame of the root
         self.gravity = rotate_inverse(self.orientation, _DOWN)
         self.links = np.zeros((len(self), 0, 3))
+        self.link_orientations = np.zeros((len(self), 0, 4))
+        self.offset = np.zeros(3)  # from the frame of the root to its centre of mass
         self.link_names: list[str] = []
         last = self.ends[self.clip_of] - max(1, round(self.least / control_dt))
         numbers = np.arange(len(self))
@@ -103,21 +105,22 @@ class Reference:
         return found
 
     def locate(self, body: Any, links: Sequence[str]) -> None:
-        """Compute where `links` of a body are in every row, and the velocity of the root's centre of mass.
+        """Compute where and how `links` of a body are in every row, and the velocity of the root's centre of mass.
 
         Call it in `build` of a `BatchTask`, as long as there is one world; it leaves the body in the first row. Joints
         of the body that the clips lack stay where they are.
         """
         one = np.zeros(1, np.int64)
         body.set_base(np.zeros((1, 3)), worlds=one)
-        self.offset = -body.link_position(body.base_name)[0]  # from the frame of the root to its centre of mass
+        self.offset = -body.link_position(body.base_name)[0]
         self.velocity = self.velocity + np.cross(self.angular_velocity, rotate(self.orientation, self.offset))
         self.link_names = list(links)
-        places = np.zeros((len(self), len(links), 3))
+        places, turns = np.zeros((len(self), len(links), 3)), np.zeros((len(self), len(links), 4))
         for row in (*range(len(self)), 0):
             self.place(body, np.array([row]), one)
             places[row] = self._find_links(body)[0]
-        self.links = places
+            turns[row] = [body.link_orientation(link)[0] for link in links]
+        self.links, self.link_orientations = places, turns
 
     def _find_links(self, body: Any) -> Array:
         """Return the positions of the links relative to the root's frame, in its heading, shape (worlds, links, 3)."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 
 Numbers = tuple[float, ...]
+_TWO_COLUMNS = 6  # numbers of two columns of a rotation matrix
 Internal = Literal["", "last_action", "time"]
 """What a controller knows itself: nothing, its last action, or the time since the start of the episode [s]."""
 
@@ -105,11 +106,12 @@ class OrientationTerm(Term):
         """The orientation."""
         return (self.orientation,)
 
-    def _split(self, orientation: Any) -> list[Any]:
-        """Return x, y, z and w, each of shape (..., 1)."""
-        if orientation.shape[-1] != 4:
-            raise ValueError(f"a quaternion of {orientation.shape[-1]} elements")
-        return [orientation[..., index : index + 1] for index in range(4)]
+
+def split_quaternion(orientation: Any) -> list[Any]:
+    """Return x, y, z and w, each of shape (..., 1); raises `ValueError` for another number of elements."""
+    if orientation.shape[-1] != 4:
+        raise ValueError(f"a quaternion of {orientation.shape[-1]} elements")
+    return [orientation[..., index : index + 1] for index in range(4)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +122,7 @@ class Gravity(OrientationTerm):
 
     def compute(self, *quantities: Any) -> list[Any]:
         """Return the third row of the rotation matrix, times -1."""
-        x, y, z, w = self._split(*quantities)
+        x, y, z, w = split_quaternion(*quantities)
         # In the order of `rotate_inverse(orientation, (0, 0, -1))`, whose bits it has: 0.0 removes the sign of zeros.
         return [
             0.0 + w * (2.0 * y) - z * (2.0 * x),
@@ -137,7 +139,7 @@ class Euler(OrientationTerm):
 
     def compute(self, *quantities: Any) -> list[Any]:
         """Return the angles about x, y and z."""
-        x, y, z, w = self._split(*quantities)
+        x, y, z, w = split_quaternion(*quantities)
         sine = np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0)
         roll = _find_angle(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
         yaw = _find_angle(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -281,13 +283,46 @@ class Playback(Term):
         *given, time = quantities
         if time.shape[-1] != 1:
             raise ValueError(f"a time of {time.shape[-1]} elements")
-        number = np.minimum(np.maximum(np.floor(time / self.dt + 0.5), 0.0), float(len(self.table) - 1))
-        row = self.rows[number[..., 0].astype(int)] if isinstance(number, np.ndarray) else number.look_up(self.rows)
+        row = self._find_row(time)
         if not given:
             return [row]
         if given[0].shape[-1] != len(self.table[0]):
             raise ValueError(f"{given[0].shape[-1]} elements, and a row has {len(self.table[0])}")
         return [given[0] - row]
+
+    def _find_row(self, time: Any) -> Any:
+        number = np.minimum(np.maximum(np.floor(time / self.dt + 0.5), 0.0), float(len(self.table) - 1))
+        if isinstance(number, np.ndarray):
+            return self.rows[number[..., 0].astype(int)]
+        return number.look_up(self.rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipOrientation(Playback):
+    """The orientation that a clip wants of a body, as the body sees it: two columns of a rotation matrix, shape (6,).
+
+    `quantity` is the body's orientation as a unit quaternion (x, y, z, w); rows of the table are the first two columns
+    of the clip's rotation matrix, one after the other. The observation has the matrix of inverse(quantity) * clip row
+    by row: elements (0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1).
+    """
+
+    kind: Literal["clip_orientation"] = "clip_orientation"  # type: ignore[assignment]
+
+    def compute(self, *quantities: Any) -> list[Any]:
+        """Return the six elements."""
+        orientation, time = quantities
+        if time.shape[-1] != 1 or len(self.table[0]) != _TWO_COLUMNS:
+            raise ValueError(f"a time of {time.shape[-1]} elements, and rows of {len(self.table[0])} numbers")
+        x, y, z, w = split_quaternion(orientation)
+        axes = [  # of the body, in the world
+            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
+            (2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
+            (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
+        ]
+        row = self._find_row(time)
+        numbers = [row[..., index : index + 1] for index in range(_TWO_COLUMNS)]
+        columns = numbers[:3], numbers[3:]
+        return [axis[0] * column[0] + axis[1] * column[1] + axis[2] * column[2] for axis in axes for column in columns]
 
 
 def find_quantity_sizes(terms: Mapping[str, Term], measured: Mapping[str, Any]) -> dict[str, int]:

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
+from rlctl.task.clip_options import ClipOptions
 from rlctl.task.motion import MotionClip, write_motion
-from rlctl.tasks.clip_options import ClipOptions
+from rlctl.task.motion_files import RobotJoints, read_clip
 from rlctl.tasks.legged_robot import load_free
 from rlctl.tasks.model_copy import copy_model, remove_floor
 from rlctl.tasks.motion_faults import Heights, find_faults, find_shift, measure_heights
-from rlctl.tasks.motion_files import RobotJoints, read_clip
 from rlctl.tasks.scaling import GRAVITY
 from rlctl.tasks.source_text import SourceText, join_source, write_list, write_number, write_string
 from rlctl.tasks.starter_robot import StarterRobot, list_faults, name_robot

@@ -12,8 +12,8 @@ from rlctl.environments import installed
 from rlctl.errors import UsageError
 from rlctl.recipe.recipe import SCHEMA_FILE
 from rlctl.storage import files as storage_files
+from rlctl.task.clip_options import ClipOptions
 from rlctl.tasks.asked_motors import AskedMotors
-from rlctl.tasks.clip_options import ClipOptions
 from rlctl.tasks.source_text import fill_template, quote_code_of_markdown
 from rlctl.tasks.starter_robot import StarterRobot, make_planar_arm, read_robot
 

@@ -14,7 +14,7 @@ from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.shipped import PRETRAINED
 from rlctl.recipe.recipe import Recipe
 from rlctl.runs.lookup import find_policy
-from rlctl.task.deployment import NOT_TRAINED, TASK
+from rlctl.task.deployment import NOT_TRAINED, TASKS
 
 # With other values the same tensors compute other actions.
 _SAME_FUNCTION = ("activation_fn", "use_sde", "squash_output", "use_expln", "clip_mean", "batch_norm_eps")
@@ -28,7 +28,7 @@ def find_source(text: str, recipe: Recipe) -> dict[str, Any]:
     ships = installed.find(text) is not None and not (Path(text) / "run.json").is_file()
     file = find_policy(text, PRETRAINED if ships else "best").file
     info = PolicyFile.read_info(file)
-    if info.spec.task == TASK:
+    if info.spec.task in TASKS:
         raise UsageError(f"--from {file}: {NOT_TRAINED}")
     if info.algo != recipe.algo:
         raise UsageError(

@@ -1,9 +1,10 @@
 """Policies of other projects: scores, and what `rlctl diagnose` says of them, sound and with an injected mistake.
 
 `python -m tests.benchmarks.foreign POLICIES.yaml [CASE ...]`: the file names public policies that somebody fetched,
-none of which is bundled: of each `policy`, `deploy`, `model` and, where the import needs them, `terrain` and `set`.
-A case is `scores`, `sound`, `mistakes`, or one of them with a name: `sound:go2`, `mistakes:b2-alphabetical`. A line per
-case; ends with 1 if fewer mistakes are named than expected, or a policy that walks is called broken.
+none of which is bundled: of each `policy`, `deploy`, `model` and, where the import needs them, `terrain`, `motion`,
+`motion_rate` and `set`. A case is `scores`, `sound`, `mistakes`, or one of them with a name: `sound:go2`,
+`mistakes:b2-alphabetical`. A line per case; ends with 1 if fewer mistakes are named than expected, or a policy that
+walks is called broken.
 """
 
 from __future__ import annotations
@@ -203,12 +204,11 @@ class Trials:
     def import_named(self, name: str) -> ImportedPolicy:
         """Return a policy as its files say."""
         files = self._policies[name]
-        deploy = None
-        if "deploy" in files:
-            deploy = Path(files["deploy"])
+        paths = {name: Path(files[name]) for name in ("deploy", "motion") if name in files}
+        others = {name: files[name] for name in ("terrain", "motion_rate") if name in files}
         return import_policy(
             Path(files["policy"]),
-            ForeignFiles(deploy, str(files["model"]), files.get("terrain")),
+            ForeignFiles(model=str(files["model"]), **paths, **others),
             settings=files.get("set"),
             output=self._folder / f"{name}.safetensors",
         )
@@ -218,8 +218,10 @@ class Trials:
         began = time.monotonic()
         imported = self.import_named(name)
         result = run_evaluation(EvalRequest(str(imported.policy.path), episodes=EPISODES))
-        error = result.metrics["velocity_error"]
-        text = f"success {result.success_rate:.0%} of {EPISODES}, velocity error {error:.3f} m/s"
+        error = f"velocity error {result.metrics['velocity_error']:.3f} m/s"
+        if imported.deployment.follows_motion:
+            error = f"error of the joints {result.metrics['joint_error']:.3f} rad"
+        text = f"success {result.success_rate:.0%} of {EPISODES}, {error}"
         print(f"scores {name}: {text}, {time.monotonic() - began:.0f} s", flush=True)
         return True
 
@@ -236,7 +238,9 @@ class Trials:
         imported = self.import_named(mistake.policy)
         network, _ = read_network(Path(self._policies[mistake.policy]["policy"]))
         parameters = imported.policy.info.spec.parameters
-        places = {name: str(parameters[name]) for name in ("robot_file", "terrain") if parameters.get(name)}
+        places = {
+            name: str(parameters[name]) for name in ("robot_file", "terrain", "motion_file") if parameters.get(name)
+        }
         robot = read_robot(Path(places["robot_file"]))
         wrong = Deployment(**mistake.change(imported.deployment.model_dump(mode="json"), robot))
         path = self._folder / f"{mistake.name}.safetensors"

@@ -25,6 +25,7 @@ from tests.exporting.controllers import build_controller, make_arm, make_policy,
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler (cc, or $CC) on this machine")
 ROWS = [[0.5, -1.0], [0.25, 2.0], [-0.75, 1.0]]
+AXES = [[1.0, 0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, -1.0, 0.0, 0.0], [0.6, 0.0, -0.8, 0.0, 1.0, 0.0]]
 TERMS = {
     "gravity": terms.Gravity("orientation"),
     "angles": terms.Scaled("angles", offset=(0.1, -0.2), scale=(2.0,)),
@@ -38,6 +39,7 @@ TERMS = {
     "clip": terms.Playback(ROWS, 0.2),
     "off": terms.Playback(ROWS, 0.2, "angles"),
     "timed": terms.Playback(ROWS, 0.25, "angles", "clip_time"),
+    "turned": terms.ClipOrientation(AXES, 0.2, "orientation"),
 }
 QUANTITIES = {"orientation": 4, "angles": 2, "goal": 3, "hand": 3, "clip_time": 1}
 SIZES = {
@@ -55,6 +57,7 @@ SIZES = {
     "clip": 2,
     "off": 2,
     "timed": 2,
+    "turned": 6,
 }
 JOINTS = Joints(["a", "b"], default_positions=[0.5, -0.5], low=[-0.4, -0.4], high=[0.4, 0.4])
 STEPS = 12
@@ -112,6 +115,7 @@ def play(policy, controllers, env):
                 "clip": ROWS[min((step + 1) // 2, 2)],
                 "off": inputs["angles"] - ROWS[min((step + 1) // 2, 2)],
                 "timed": inputs["angles"] - ROWS[int(np.clip(np.floor(inputs["clip_time"][0] / 0.25 + 0.5), 0, 2))],
+                "turned": TERMS["turned"]((inputs["orientation"], np.array([step * 0.1]))),
             }
             stacked = history.add({name: np.asarray(part)[None] for name, part in parts.items()}, slice(None))
             last = policy.predict(np.concatenate([np.ravel(part) for part in stacked.values()]).astype(np.float32))

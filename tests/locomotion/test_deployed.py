@@ -1,5 +1,7 @@
 """An imported policy walks, is evaluated and exported as rlctl's own, and its mistakes are named."""
 
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,10 @@ from rlctl.importing.foreign.import_policy import import_policy
 from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.load import check_playable
-from rlctl.task.deployment import TASK, Deployment
+from rlctl.task.deployment import MOTION_TASK, TASK, Deployment
+from rlctl.task.model_files import find_model_file
+from rlctl.task.motion import MotionClip, write_motion
+from rlctl.task.mujoco.robot import read_robot
 from rlctl_robot.diagnose.deployed import diagnose_deployment
 from rlctl_robot.diagnose.mapped_actor import map_action, map_observation
 from tests.importing.foreign.policies import A1, describe_walk, expect_as, read_walk, write_onnx, write_yaml
@@ -83,6 +88,66 @@ def test_wheels_follow_speeds():
     # The damper of 1 N m s/rad pushes towards 0.25 * 4 = 1 rad/s.
     assert 0.2 < observation[0, 2] < 1.5
     worlds.close()
+
+
+@pytest.fixture
+def standing(tmp_path):
+    """Return how a policy of the A1 follows a clip of 0.6 s in which it stands, as a specification."""
+    robot = read_robot(find_model_file(A1))
+    described = describe_walk(
+        observations=[{"kind": kind} for kind in ("motion", "anchor_orientation", "joint_positions")],
+        commands={},
+        anchor="FR_hip",
+        start_height=0.31,
+    )
+    pose = dict(zip(described["joints"], described["default_positions"], strict=True))
+    frames = 30
+    clip = MotionClip(
+        name="stand",
+        rate=50.0,
+        root_position=np.tile([0.0, 0.0, 1.0], (frames, 1)),  # recorded on another floor
+        root_orientation=np.tile([0.0, 0.0, 0.0, 1.0], (frames, 1)),
+        joint_names=robot.joints,
+        joint_positions=np.tile([pose[name] for name in robot.joints], (frames, 1)),
+    )
+    file = tmp_path / "stand.motion.csv"
+    file.write_bytes(write_motion(clip))
+    parameters = {"deployment": described, "robot_file": A1, "motion_file": str(file), "random_start": False}
+    return EnvSpec(MOTION_TASK, parameters)
+
+
+def test_a_clip_is_followed_to_its_end(standing):
+    with contextlib.closing(standing.make_worlds(2)) as worlds:
+        worlds.reset(np.arange(2), [0, 1])
+        task = worlds.task
+        assert task.body.base_position[:, 2] == pytest.approx([0.31, 0.31])
+        for _ in range(28):
+            step = worlds.step(np.zeros((2, 12), np.float32))
+            assert not (step.terminated | step.truncated).any()
+        assert np.abs(step.observation[:, 24:30] - [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]).max() < 0.1
+        last = worlds.step(np.zeros((2, 12), np.float32))
+    assert last.truncated.all()
+    assert last.success.all()
+    assert task.commands() == {}
+
+
+def test_a_clip_of_other_joints_is_refused(standing, tmp_path):
+    file = tmp_path / "stand.motion.csv"
+    header, rest = file.read_text().split("\n", 1)
+    names = header.split(",")
+    names[-1], names[-2] = names[-2], names[-1]
+    file.write_text("\n".join([",".join(names), rest]))
+    with pytest.raises(TaskError, match=r"stand.motion.csv: its joints are not those of a1\.urdf, in their order"):
+        standing.make_worlds(1)
+
+
+def test_a_variant_reads_the_clip_in_its_own_order(standing):
+    own = Deployment(**standing.parameters["deployment"])
+    swapped = [*own.joints[3:6], *own.joints[:3], *own.joints[6:]]
+    other = Deployment(**{**standing.parameters["deployment"], "joints": swapped})
+    seen = map_observation(own, other, own)
+    # Positions and velocities of its joint 0 are those of joint 3.
+    assert (seen.source[0], seen.source[12]) == (3, 15)
 
 
 def test_variants_read_and_send_what_another_deployment_says():

@@ -31,6 +31,12 @@ def test_a_file_has_the_clip(tmp_path):
     assert read.joint_positions == pytest.approx(motion.joint_positions)
 
 
+def test_a_clip_of_minutes_is_read_back(tmp_path):
+    # 130 s at 30 Hz: with six digits, its last times would be 0.033 or 0.034 s apart.
+    (tmp_path / "clip.csv").write_bytes(write_motion(make_motion(3900, 30.0)))
+    assert read_motion(tmp_path / "clip.csv").rate == 30.0
+
+
 def test_rows_between_frames():
     # 5 frames at 10 Hz last 0.4 s: at 20 Hz that is 9 rows, every other one in the middle of two frames.
     rows = make_motion().resample(20.0)

@@ -72,6 +72,19 @@ def test_terms_of_other_projects_by_hand():
         terms.Scaled("q", clip=(1.0,))
 
 
+def test_the_orientation_of_a_clip_is_seen_from_the_body():
+    half = np.sqrt(0.5)
+    # The clip is turned by a quarter about z: its x axis is y in the world, its y axis -x.
+    term = terms.ClipOrientation([[0.0, 1.0, 0.0, -1.0, 0.0, 0.0]], 0.1, "orientation")
+    same = term((np.array([0.0, 0.0, half, half]), np.array([0.0])))
+    assert same == pytest.approx([1.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the first two columns of the identity
+    seen = term((np.array([[0.0, 0.0, 0.0, 1.0]]), np.array([[0.0]])))
+    # Rows of the matrix of a quarter about z: (0, -1), (1, 0), (0, 0).
+    assert seen[0] == pytest.approx([0.0, -1.0, 1.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="rows of 2 numbers"):
+        terms.ClipOrientation([[1.0, 0.0]], 0.1, "orientation")((np.zeros(4), np.array([0.0])))
+
+
 def test_euler_angles_are_those_of_a_rotation():
     for quaternion in normalize(np.random.default_rng(1).normal(size=(50, 4))):
         assert terms.Euler()(quaternion) == pytest.approx(roll_pitch_yaw(quaternion), abs=1e-6)

@@ -9,9 +9,9 @@ import pytest
 from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
+from rlctl.task.clip_options import ClipOptions
 from rlctl.task.worlds import TaskWorlds
 from rlctl.tasks import new
-from rlctl.tasks.clip_options import ClipOptions
 from tests.tasks.test_motion_faults import BENT
 from tests.tasks.test_new import run
 from tests.tasks.test_new_walk import read_task, write_dog

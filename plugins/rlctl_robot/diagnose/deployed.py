@@ -19,7 +19,7 @@ from rlctl.play.playing import Playing
 from rlctl.policy.actor import Actor, Rows
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
-from rlctl.task.deployment import TASK, Deployment
+from rlctl.task.deployment import TASKS, Deployment
 from rlctl.task.mujoco.robot import Robot, read_robot
 from rlctl_robot.diagnose.mapped_actor import MappedActor
 from rlctl_robot.diagnose.variants import Variant, list_variants
@@ -45,7 +45,8 @@ class Score:
 
     up: float  # part of the episodes that end upright
     time_up: float  # mean part of the time
-    error: float  # mean velocity error [m/s]
+    error: float  # mean velocity error [m/s], or of a policy that follows a clip mean error of the joints [rad]
+    follows_motion: bool = False
 
     @property
     def walks(self) -> bool:
@@ -59,7 +60,10 @@ class Score:
 
     def describe(self) -> str:
         """Return the score as text."""
-        return f"{self.up:.0%} of the episodes end upright, velocity error {self.error:.2f} m/s"
+        error = f"velocity error {self.error:.2f} m/s"
+        if self.follows_motion:
+            error = f"error of the joints {self.error:.2f} rad"
+        return f"{self.up:.0%} of the episodes end upright, {error}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +89,7 @@ class DeploymentDiagnosis:
 
 def is_deployed(spec: EnvSpec) -> bool:
     """Return whether a task is that of imported policies."""
-    return spec.task == TASK
+    return spec.task in TASKS
 
 
 def diagnose_deployment(
@@ -133,6 +137,8 @@ def _is_named(score: Score, own: Score) -> bool:
 def _place(variant: Variant, own: Deployment, robot: Robot) -> Deployment:
     """Return a variant's deployment, with the height at which its default pose stands."""
     changed = variant.deployment
+    if changed.follows_motion:  # it starts in its clip
+        return changed
     if changed.default_positions == own.default_positions and changed.joints == own.joints:
         return changed
     height = robot.measure_start(dict(zip(changed.joints, changed.default_positions, strict=True)))
@@ -161,7 +167,8 @@ class _Player:
         """Play a deployment in worlds of its own."""
         with contextlib.closing(self._make_worlds(deployment, count)) as worlds:
             actor = MappedActor(NumpyActor(self._policy, count), self._own, deployment, [deployment] * count)
-            return _summarize(_play(worlds, actor, self._list_seeds(count), seconds))
+            played = _play(worlds, actor, self._list_seeds(count), seconds)
+            return _summarize(played, deployment.follows_motion)
 
     def _rank_mapped(self, variants: Sequence[Variant]) -> list[float]:
         """Return ranks of variants that need no other robot, played together in the worlds of the file's."""
@@ -189,7 +196,7 @@ class _Player:
 
 
 def _play(worlds: Any, actor: Actor, seeds: Sequence[int], seconds: float) -> np.ndarray:
-    """Play an episode in each world; return whether it ended upright, the part of the time, and the velocity error."""
+    """Play an episode in each world; return whether it ended upright, the part of the time, and the mean error."""
     index = np.arange(len(seeds))
     steps = max(1, round(seconds / worlds.task.control_dt))
     playing = Playing(worlds)
@@ -200,17 +207,18 @@ def _play(worlds: Any, actor: Actor, seeds: Sequence[int], seconds: float) -> np
     for played in playing.play(actor, index, observations):
         alive[played.index] += 1
         errors[played.index] += worlds.task.error[played.index]
-        fell[played.ended] = True
+        fell[played.index[played.result.terminated]] = True
         over = played.index[worlds.step_of[played.index] >= steps]
         if len(over):
             fell[over] &= alive[over] < steps
             playing.stop(over)
-    return np.stack([1.0 - fell, alive / steps, errors / np.maximum(alive, 1)], axis=1)
+    time_up = np.where(fell, alive / steps, 1.0)  # also where a clip ended first
+    return np.stack([1.0 - fell, time_up, errors / np.maximum(alive, 1)], axis=1)
 
 
-def _summarize(played: np.ndarray) -> Score:
+def _summarize(played: np.ndarray, follows_motion: bool = False) -> Score:
     up, time_up, error = played.mean(axis=0).tolist()
-    return Score(up, time_up, error)
+    return Score(up, time_up, error, follows_motion)
 
 
 def show(result: DeploymentDiagnosis, json: str | None) -> None:

@@ -52,6 +52,8 @@ def _measure(own: Deployment, variant: Deployment) -> tuple[NDArray[Any], NDArra
         elements, factors, offsets = np.arange(part.size), np.ones(part.size), np.zeros(part.size)
         if part.name in ("joint_positions", "joint_velocities", "last_action"):
             elements = joints
+        elif part.name == "motion":
+            elements = np.concatenate([joints, len(joints) + joints])
         if part.name == "joint_positions":
             offsets = own_default - default
         elif part.name == "last_action":

@@ -197,7 +197,7 @@ def _list_scales(deployment: Deployment) -> Iterator[Variant]:
         1 / degree: "is in radians, the policy expects degrees",
     }
     for part in deployment.observations:
-        if part.kind in ("phase", "gravity"):
+        if part.kind in ("phase", "gravity", "anchor_orientation"):
             continue
         for factor in _FACTORS:
             text = f"{part.kind}: its scale is {1 / factor:g} times the policy's"

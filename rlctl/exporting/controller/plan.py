@@ -17,7 +17,7 @@ from rlctl.limits.fitting import FittedLimits
 from rlctl.policy.c_policy import observation_type
 from rlctl.task.joints import Command
 from rlctl.task.layout import Layout, Part
-from rlctl.task.terms import Gravity, Internal, Playback, Scaled
+from rlctl.task.terms import ClipOrientation, Gravity, Internal, Playback, Scaled
 
 _UNITS = {
     "position": "rad or m",
@@ -294,6 +294,8 @@ class ControllerPlan:
 def _describe_term(term: AnyTerm) -> str:
     if isinstance(term, Playback):
         rows = f"{len(term.table)} rows of a clip, at {term.time or 'the time of the episode'}"
+        if isinstance(term, ClipOrientation):
+            return f"rotation from {term.quantity} to {rows}"
         return f"{term.quantity} - {rows}" if term.quantity else rows
     if not isinstance(term, Scaled):
         return " ".join([term.kind.replace("_", " "), *(["of"] if term.inputs else []), ", ".join(term.inputs)]).strip()

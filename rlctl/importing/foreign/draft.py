@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rlctl.environments.spec import merge
 from rlctl.errors import UsageError, check_name
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.storage import validation
-from rlctl.task.deployment import Deployment
+from rlctl.task.deployment import MOTION, Deployment
+from rlctl.task.motion import MotionClip
 from rlctl.task.mujoco.robot import Robot
 
 _OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature")
 _REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")
 _USUAL_COMMANDS = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.5, 0.5]}
+_USUAL_ANCHOR = "torso_link"  # of Unitree's G1, with which whole_body_tracking and mjlab train
 _USUAL_ARMATURE = 0.01  # [kg m^2], of motors and gears of walking robots
 _FORMS = {
     "default_positions": "[0.1, 0.8, ..]",
@@ -34,8 +37,11 @@ class Draft:
     source: str  # the file, for errors
     values: dict[str, Any]
     notes: list[str] = dataclasses.field(default_factory=list)
+    motion: Path | None = None  # the clip that the file names
 
-    def complete(self, settings: Mapping[str, Any], robot: Robot, network: ForeignNetwork) -> Deployment:
+    def complete(
+        self, settings: Mapping[str, Any], robot: Robot, network: ForeignNetwork, clip: MotionClip | None = None
+    ) -> Deployment:
         """Return the deployment; `settings` override what the file says.
 
         Raises `UsageError` for what is missing, for joints that the robot does not have, and for sizes that do not fit
@@ -61,9 +67,14 @@ class Draft:
             values["action_clip"] = [-1.0, 1.0]
         if "start_height" not in values:
             pose = dict(zip(joints, values["default_positions"], strict=False))
-            values["start_height"] = round(robot.measure_start(pose), 4)
+            turn: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+            if clip is not None:
+                pose = dict(zip(clip.joint_names, clip.joint_positions[0].tolist(), strict=True))
+                turn = clip.root_orientation[0].tolist()
+            values["start_height"] = round(robot.measure_start(pose, turn), 4)
         deployment = validation.build(Deployment, values, UsageError, self.source)
         self._check_sizes(deployment, network)
+        self._check_motion(deployment, clip)
         return deployment
 
     def _guess_joints(self, values: dict[str, Any], robot: Robot, network: ForeignNetwork) -> None:
@@ -91,7 +102,13 @@ class Draft:
                 self.notes.append(f"{key}: guessed that of the position actuators of {robot.path.name}")
 
     def _guess_others(self, values: dict[str, Any], robot: Robot) -> None:
-        if not values.get("commands"):
+        observed = values["observations"]
+        if not isinstance(observed, list):
+            observed = []  # which validation refuses
+        kinds = [part.get("kind") for part in observed if isinstance(part, dict)]
+        if "anchor_orientation" in kinds:
+            self._guess_anchor(values, robot)
+        if not values.get("commands") and not set(kinds) & set(MOTION):
             values["commands"] = _USUAL_COMMANDS
             ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in _USUAL_COMMANDS.items())
             self.notes.append(f"commands: the file has no ranges; guessed {ranges} [m/s, rad/s]")
@@ -101,6 +118,25 @@ class Draft:
         endless = [name for name in values["joints"] if not robot.limits.get(name)]
         if not values.get("max_torque") and endless:
             self.notes.append(f"max_torque: {robot.path.name} has no limit for {endless[0]}; it is not limited")
+
+    def _guess_anchor(self, values: dict[str, Any], robot: Robot) -> None:
+        if "anchor" not in values:
+            values["anchor"] = robot.links[0]
+            if _USUAL_ANCHOR in robot.links:
+                values["anchor"] = _USUAL_ANCHOR
+            self.notes.append(
+                f"anchor: the file does not name the link of anchor_orientation; guessed {values['anchor']}"
+            )
+        if values["anchor"]:
+            check_name(values["anchor"], robot.links, f"{self.source}: {robot.path.name} has no link", UsageError)
+
+    def _check_motion(self, deployment: Deployment, clip: MotionClip | None) -> None:
+        if deployment.follows_motion and clip is None:
+            raise UsageError(
+                f"{self.source}: the policy follows a clip; give the one it was trained with: --motion FILE.csv or .npz"
+            )
+        if clip is not None and not deployment.follows_motion:
+            raise UsageError(f"{self.source}: the policy observes no clip; leave out --motion {clip.name}")
 
     def _check_sizes(self, deployment: Deployment, network: ForeignNetwork) -> None:
         if len(deployment.joints) != network.action_size:
@@ -127,8 +163,9 @@ def pick(values: Sequence[Any], order: Sequence[int], source: str, name: str) ->
 
 
 def refuse_motion(name: str, source: str) -> None:
-    """Raise `UsageError` for an observation of a policy that tracks a motion: by a reference, or by its phase."""
+    """Raise `UsageError` for what rlctl does not observe of a motion: where the robot is on it, or its phase alone."""
     if "motion" in name or "anchor" in name or name.endswith("/phase"):
         raise UsageError(
-            f"{source}: observes {name}: it tracks a motion; only policies that follow velocity commands are imported"
+            f"{source}: observes {name}, which is not imported; of a motion, policies may observe motion_command and "
+            "motion_anchor_ori_b"
         )

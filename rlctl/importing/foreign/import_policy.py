@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from rlctl import output
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.spec import EnvSpec
@@ -16,15 +18,19 @@ from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.importing.foreign import metadata, own, rl_sar, unitree_gym, unitree_lab
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
-from rlctl.importing.foreign.onnx_network import read_onnx
+from rlctl.importing.foreign.onnx_network import read_onnx, read_tables
 from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.importing.foreign.torchscript import read_torchscript_network
 from rlctl.importing.import_model import write_checked
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.recipe.sources import OF_THE_ENVIRONMENT, parse_settings
 from rlctl.storage import yaml_text
-from rlctl.task.deployment import TASK, Deployment
+from rlctl.storage.files import write_bytes
+from rlctl.task.clip_options import ClipOptions
+from rlctl.task.deployment import MOTION_TASK, TASK, Deployment
 from rlctl.task.model_files import find_model_file
+from rlctl.task.motion import MotionClip, write_motion
+from rlctl.task.motion_files import RobotJoints, read_clip
 from rlctl.task.mujoco.robot import Robot, read_robot
 from rlctl.version import collect_versions
 
@@ -90,7 +96,7 @@ def import_to_play(policy: str | None, files: ForeignFiles, settings: Sequence[s
     of_deployment = [text for text in settings if kinds[text] not in OF_THE_ENVIRONMENT]
     file = Path(policy)
     imported = _read(file, files, parse_settings(of_deployment), Path(f"{file.stem}.safetensors"))
-    target = _choose_name(imported.policy)
+    target = _choose_name(Path(str(imported.policy.path)), imported.policy.encode())
     if not target.exists():
         write_checked(target, str(file), imported.policy)
     notes = [f"  {note}" for note in imported.notes]
@@ -99,9 +105,8 @@ def import_to_play(policy: str | None, files: ForeignFiles, settings: Sequence[s
     return str(target), of_environment
 
 
-def _choose_name(policy: PolicyFile) -> Path:
-    """Return where a policy is stored: a new file, or one that has this policy already."""
-    content, first = policy.encode(), Path(str(policy.path))
+def _choose_name(first: Path, content: bytes) -> Path:
+    """Return where content is stored: a new file, with a number if need be, or one that has this content already."""
     path = first
     for number in itertools.count(2):
         if not path.exists() or path.read_bytes() == content:
@@ -117,12 +122,49 @@ def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: 
     network, own_metadata = read_network(file)
     robot = read_robot(find_model_file(files.model))
     draft, form = read_draft(file, files.deploy, own_metadata, robot, network)
-    deployment = draft.complete(settings, robot, network)
-    ground = ""
+    chosen = files.motion or draft.motion
+    if chosen is None:
+        clip, found = _read_own_clip(file, own_metadata, draft, settings, robot)
+    else:
+        clip, found = _read_clip(chosen, files.motion_rate, robot)
+    deployment = draft.complete(settings, robot, network, clip)
+    ground = motion = ""
     if files.terrain:
         ground = str(find_model_file(files.terrain).resolve())
-    policy = make_policy(network, deployment, {"robot_file": str(robot.path), "terrain": ground}, target)
-    return ImportedPolicy(policy, deployment, form, tuple(draft.notes))
+    if clip is not None:
+        motion = str(_write_clip(clip, target.absolute().parent))
+    places = {"robot_file": str(robot.path), "terrain": ground, "motion_file": motion}
+    policy = make_policy(network, deployment, places, target)
+    return ImportedPolicy(policy, deployment, form, (*draft.notes, *found))
+
+
+def _read_clip(file: Path, rate: float | None, robot: Robot) -> tuple[MotionClip, list[str]]:
+    """Return the clip of a policy that follows one, and what was found in its file."""
+    low, high = np.array([robot.ranges[name] for name in robot.joints]).T
+    joints = RobotJoints(robot.path.name, robot.joints, robot.breadth_first, low, high, np.clip(0.0, low, high))
+    return read_clip(str(file), joints, ClipOptions(rate=rate, rate_option="--motion-rate"))
+
+
+def _read_own_clip(
+    file: Path, own_metadata: Mapping[str, str], draft: Draft, settings: Mapping[str, Any], robot: Robot
+) -> tuple[MotionClip | None, list[str]]:
+    """Return the clip in the graph of an ONNX file, whose rows are one per action, if there is one."""
+    control_dt = settings.get("control_dt", draft.values.get("control_dt"))
+    if not metadata.matches(own_metadata) or not isinstance(control_dt, int | float) or not control_dt > 0:
+        return None, []
+    tables = read_tables(file)
+    if not metadata.has_clip(tables):
+        return None, []
+    clip = metadata.read_clip(own_metadata, tables, str(file), robot, 1.0 / control_dt)
+    return clip, [f"clip: {len(clip)} rows in {file.name}, one per action; {clip.duration:.2f} s"]
+
+
+def _write_clip(clip: MotionClip, folder: Path) -> Path:
+    """Write a clip next to the policy that follows it, unless the same one is there; return its file."""
+    path = _choose_name(folder / f"{clip.name}.motion.csv", write_motion(clip))
+    if not path.exists():
+        write_bytes(path, write_motion(clip))
+    return path
 
 
 def read_network(file: Path) -> tuple[ForeignNetwork, dict[str, str]]:
@@ -160,7 +202,10 @@ def make_policy(network: ForeignNetwork, deployment: Deployment, places: Mapping
     from rlctl.policy.torch_policy import build_network, describe_network, policy_name
 
     parameters = {"deployment": deployment.dump(), **{name: value for name, value in places.items() if value}}
-    spec = EnvSpec(TASK, parameters).resolve()
+    task = TASK
+    if deployment.follows_motion:
+        task = MOTION_TASK
+    spec = EnvSpec(task, parameters).resolve()
     with contextlib.closing(spec.make_worlds(1)) as worlds:
         env = describe_worlds(worlds)
     info = PolicyInfo(

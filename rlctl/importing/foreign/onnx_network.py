@@ -34,6 +34,8 @@ _RECURRENT = ("LSTM", "GRU", "RNN")
 _LSTM = "lstm"
 _STATES_AT = 5  # of the inputs of an LSTM node: the hidden state, then the cell state
 _GATES = (0, 2, 3, 1)  # ONNX has input, output, forget, cell; torch input, forget, cell, output
+_ROW = "time_step"  # input that chooses the row of a clip in the graph
+_WEIGHTS_SUFFIX = ".onnx.data"
 _MOST_NODES = 2000
 _COMPARED, _TOLERANCE = 16, 1e-4  # random observations with which the network is compared with the graph
 
@@ -42,12 +44,65 @@ def read_onnx(path: Path) -> tuple[ForeignNetwork, dict[str, str]]:
     """Return the network of a graph and the graph's metadata; raises `ArtifactError` for one that is not imported."""
     content = untrusted.read_bytes(path, LARGEST_FILE)
     try:
+        content = _embed_weights(content, path.parent)
         check(content)
         network, metadata = _read(content)
         _compare(content, network)
     except ValueError as error:
         raise ArtifactError(f"{path}: {short_repr(str(error), 300)}") from None
     return network, metadata
+
+
+def read_tables(path: Path) -> dict[str, Array]:
+    """Return the constant tables from which a graph's other outputs take a row: the clip of a policy that follows one.
+
+    whole_body_tracking and mjlab write them, with the input `time_step` that chooses the row.
+    """
+    import onnx
+
+    content = _embed_weights(untrusted.read_bytes(path, LARGEST_FILE), path.parent)
+    graph = onnx.ModelProto.FromString(content).graph
+    constants = {tensor.name: tensor for tensor in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Constant" and node.attribute and node.attribute[0].name == "value":
+            constants[node.output[0]] = node.attribute[0].t
+    outputs = {value.name for value in graph.output}
+    return {
+        node.output[0]: onnx.numpy_helper.to_array(constants[node.input[0]]).astype(np.float64)
+        for node in graph.node
+        if node.op_type == "Gather" and node.output[0] in outputs and node.input[0] in constants
+    }
+
+
+def _embed_weights(content: bytes, folder: Path) -> bytes:
+    """Return a graph with the weights that torch wrote into a file next to it, `NAME.onnx.data`.
+
+    Only such a file is read: any other place would be a path that the sender chose.
+    """
+    import onnx
+
+    try:
+        model = onnx.ModelProto.FromString(content)
+    except Exception:  # protobuf's own error; `check` says what is wrong
+        return content
+    outside = [tensor for tensor in model.graph.initializer if tensor.external_data]
+    if not outside:
+        return content
+    read: dict[str, bytes] = {}
+    for tensor in outside:
+        entries = {entry.key: entry.value for entry in tensor.external_data}
+        name = entries.get("location", "")
+        if Path(name).name != name or not name.endswith(_WEIGHTS_SUFFIX):
+            raise NotImportable(f"its weights are in {name!r}; only a file NAME{_WEIGHTS_SUFFIX} next to it is read")
+        if name not in read:
+            read[name] = untrusted.read_bytes(folder / name, LARGEST_FILE)
+        start, length = (int(entries.get(key, 0)) for key in ("offset", "length"))
+        if start < 0 or length <= 0 or start + length > len(read[name]):
+            raise NotImportable(f"{name} is too short: it lacks the weights {tensor.name!r}")
+        tensor.raw_data = read[name][start : start + length]
+        tensor.data_location = onnx.TensorProto.DEFAULT
+        tensor.ClearField("external_data")
+    return model.SerializeToString()
 
 
 def _read(content: bytes) -> tuple[ForeignNetwork, dict[str, str]]:
@@ -58,9 +113,12 @@ def _read(content: bytes) -> tuple[ForeignNetwork, dict[str, str]]:
     constants = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
     _check_form(graph, constants)
     reader = _ChainReader(constants)
+    reader.of_clip |= {value.name for value in graph.input if value.name == _ROW}
     reader.values[_list_inputs(graph, constants)[0].name] = []
     for node in graph.node:
         reader.read(node)
+    if graph.output[0].name in reader.of_clip:
+        raise NotImportable(f"its actions depend on {_ROW}, not only on the observation")
     layers = reader.values.get(graph.output[0].name)
     if layers is None:
         raise NotImportable("its output does not depend on its input")
@@ -73,9 +131,12 @@ def _read(content: bytes) -> tuple[ForeignNetwork, dict[str, str]]:
 
 
 def _list_inputs(graph: onnx.GraphProto, constants: dict[str, Any]) -> list[onnx.ValueInfoProto]:
-    """Return the inputs of a graph, without weights and without the states of an LSTM."""
+    """Return the inputs of a graph, without weights, the states of an LSTM, and the row of a clip."""
     states = {name for node in graph.node if node.op_type == "LSTM" for name in node.input[_STATES_AT:]}
-    return [value for value in graph.input if value.name not in constants and value.name not in states]
+    own = [value for value in graph.input if value.name not in constants and value.name not in states]
+    if len(own) > 1 and any(node.op_type == "Gather" for node in graph.node):
+        own = [value for value in own if value.name != _ROW]
+    return own
 
 
 def _check_form(graph: onnx.GraphProto, constants: dict[str, Any]) -> None:
@@ -91,10 +152,7 @@ def _check_form(graph: onnx.GraphProto, constants: dict[str, Any]) -> None:
     if recurrent not in ([], ["LSTM"]):
         raise NotImportable(f"its graph has hidden states ({', '.join(recurrent)}); one layer of LSTM is imported")
     if len(inputs) != 1:
-        hint = ""
-        if "time_step" in names:
-            hint = "; it plays a motion, and only policies that follow velocity commands are imported"
-        raise NotImportable(f"its graph has {len(inputs)} inputs ({names}), expected one: the observation{hint}")
+        raise NotImportable(f"its graph has {len(inputs)} inputs ({names}), expected one: the observation")
     shape = [dimension.dim_value or 0 for dimension in inputs[0].type.tensor_type.shape.dim]
     if len(shape) not in (1, 2):
         raise NotImportable(f"its input {names} has {len(shape)} axes, expected (batch, size)")
@@ -108,6 +166,7 @@ class _ChainReader:
     def __init__(self, constants: dict[str, NDArray[Any]]) -> None:
         self.constants = constants
         self.values: dict[str, list[Layer]] = {}
+        self.of_clip: set[str] = set()  # values from which a row of a clip is read, which no action depends on
 
     def read(self, node: onnx.NodeProto) -> None:
         """Read a node; raises `NotImportable` for an operator that no perceptron has."""
@@ -119,6 +178,9 @@ class _ChainReader:
             self.constants[node.output[0]] = np.asarray(
                 onnx.numpy_helper.to_array(value) if value is not None else next(iter(attributes.values()))
             )
+            return
+        if self.of_clip & set(node.input):
+            self.of_clip |= set(node.output)
             return
         moving = [name for name in node.input if name in self.values]
         if not moving:
@@ -244,10 +306,12 @@ def _read_affine(kind: str, number: Any, *, is_first: bool) -> tuple[Any, Any]:
 def _compare(content: bytes, network: ForeignNetwork) -> None:
     """Raise `NotImportable` if the graph computes something else than the network that was read from it."""
     session = open_session(content)
-    given, *states = session.get_inputs()
+    given, *states = (value for value in session.get_inputs() if value.name != _ROW)
     rows = np.random.default_rng(0).normal(size=(_COMPARED, network.observation_size)).astype(np.float32)
     size = 0 if network.lstm is None else network.lstm.hidden_size
     feed = {state.name: np.zeros((1, 1, size), np.float32) for state in states}
+    if any(value.name == _ROW for value in session.get_inputs()):
+        feed[_ROW] = np.zeros((1, 1), np.float32)
     own = np.zeros((2, size))  # hidden and cell state
     for row in rows:
         feed[given.name] = row[None] if len(given.shape) == 2 else row

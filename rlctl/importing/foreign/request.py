@@ -20,6 +20,12 @@ class ForeignFiles:
         None
     )
     terrain: Annotated[str | None, Option("Its ground: URDF or MJCF.", metavar="FILE", default_text="flat")] = None
+    motion: Annotated[
+        Path | None, Option("The clip that a policy of another project follows: .csv or .npz.", metavar="FILE")
+    ] = None
+    motion_rate: Annotated[
+        float | None, Option("Frames per second of that clip, if the file does not say.", metavar="HZ", min=1e-3)
+    ] = None
 
     @property
     def is_given(self) -> bool:

@@ -24,6 +24,8 @@ _TERMS = {
     "dof_pos": "joint_positions",
     "dof_vel": "joint_velocities",
     "actions": "last_action",
+    "whole_body_tracking/motion_command": "motion",
+    "whole_body_tracking/motion_anchor_ori_b": "anchor_orientation",
 }
 _SCALES = {
     "lin_vel": "lin_vel_scale",
@@ -68,6 +70,8 @@ def read(content: Mapping[str, Any], source: str, robot: Robot, network: Foreign
     if sorted(ages) != list(range(len(ages))):
         raise UsageError(f"{source}: observations_history {ages} leaves steps out, which rlctl does not import")
     values["observations"] = [_read_term(name, merged, len(ages), source) for name in config["observations"]]
+    if isinstance(config.get("motion_file"), str):
+        draft.motion = Path(source).parent / Path(config["motion_file"]).name
     if config.get("clip_obs", _WIDE) < _WIDE:
         draft.notes.append(f"clip_obs: {config['clip_obs']:g} is left out")
     return draft
@@ -88,7 +92,8 @@ def _read_base(config: Path, robot: str) -> dict[str, Any]:
 
 
 def _read_term(name: str, config: Mapping[str, Any], history: int, source: str) -> dict[str, Any]:
-    refuse_motion(name, source)
+    if name not in _TERMS:
+        refuse_motion(name, source)
     check_name(name, _TERMS, f"{source}: no known observation is", UsageError, listed="It knows")
     part: dict[str, Any] = {"kind": _TERMS[name], "history": history}
     scale = config.get(_SCALES.get(name, ""), 1.0)

@@ -28,13 +28,17 @@ class Robot:
     motors: tuple[str, ...]  # joints in the order of the file's actuators; empty if not all have one
     breadth_first: tuple[str, ...]  # joints by their distance from the base, as Isaac Lab orders them
     limits: Mapping[str, float]  # torque by joint [N m]; 0: none
+    ranges: Mapping[str, tuple[float, float]]  # lowest and highest position by joint [rad]
+    links: tuple[str, ...]  # the base is the first
     has_armature: bool
     keyframe: str = ""  # name of the file's keyframe `home`, or of its first
     pose: Mapping[str, float] = dataclasses.field(default_factory=dict)  # [rad], of the keyframe
     gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     """Stiffness [N m/rad] and damping [N m s/rad] by joint, of the file's position actuators."""
 
-    def measure_start(self, positions: Mapping[str, float]) -> float:
+    def measure_start(
+        self, positions: Mapping[str, float], orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+    ) -> float:
         """Return the height of the trunk's centre of mass [m] at which the feet are just above flat ground."""
         from rlctl.task.mujoco.sim import MujocoSim
 
@@ -42,7 +46,7 @@ class Robot:
         ground = sim.load("ground", "plane.urdf", fixed=True)
         body = sim.load("robot", self.path, floor=False)
         sim.save()
-        body.set_base((0.0, 0.0, _HIGH))
+        body.set_base((0.0, 0.0, _HIGH), orientation)
         body.set_joints(np.array([positions.get(name, 0.0) for name in body.joint_names]))
         distance = body.distance_to(ground)
         if not np.isfinite(distance):
@@ -70,6 +74,11 @@ def read_robot(path: Path) -> Robot:
         motors=_list_motors(path, body.joint_names),
         breadth_first=_sort_by_depth(body),
         limits=dict(zip(body.joint_names, body.joint_max_force.tolist(), strict=True)),
+        ranges={
+            name: (float(low), float(high))
+            for name, low, high in zip(body.joint_names, body.joint_low, body.joint_high, strict=True)
+        },
+        links=(body.base_name, *body.link_names),
         has_armature=bool(armature.any()),
         keyframe=keyframe,
         pose=pose,

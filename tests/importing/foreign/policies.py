@@ -135,3 +135,19 @@ def write_torchscript(path, sizes, kind=Exported, activation=torch.nn.ELU):
     module = kind(torch.nn.Sequential(*layers[:-1]), Normalizer(mean, std))
     torch.jit.script(module).save(str(path))
     return module
+
+
+def add_clip(path, tables):
+    """Add a clip to an ONNX file as whole_body_tracking does: an input that chooses a row, and an output per table."""
+    model = onnx.load(path)
+    graph = model.graph
+    graph.input.append(helper.make_tensor_value_info("time_step", TensorProto.FLOAT, [1, 1]))
+    graph.initializer.append(numpy_helper.from_array(np.array([1], np.int64), "axes"))
+    graph.node.append(helper.make_node("Squeeze", ["time_step", "axes"], ["flat"]))
+    graph.node.append(helper.make_node("Cast", ["flat"], ["row"], to=TensorProto.INT64))
+    for name, table in tables.items():
+        graph.initializer.append(numpy_helper.from_array(table.astype(np.float32), f"table_{name}"))
+        graph.node.append(helper.make_node("Gather", [f"table_{name}", "row"], [name], axis=0))
+        graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, *table.shape[1:]]))
+    onnx.save(model, path)
+    return path

@@ -1,5 +1,7 @@
 """Files of each project become a policy that acts as in that project; what they lack is asked for by name."""
 
+import contextlib
+import dataclasses
 import itertools
 import re
 
@@ -8,13 +10,16 @@ import pytest
 
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.importing.foreign.import_policy import import_policy, import_to_play
+from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork
 from rlctl.importing.foreign.request import ForeignFiles
 from rlctl.policy.load import load_policy
-from rlctl.task.deployment import TASK, Deployment
+from rlctl.task.deployment import MOTION_TASK, TASK, Deployment
+from rlctl.task.motion import read_motion
 from rlctl_locomotion.quadruped import JOINTS
 from tests.importing.foreign.policies import (
     A1,
     STANCE,
+    add_clip,
     describe_walk,
     expect_as,
     read_walk,
@@ -151,6 +156,8 @@ def test_metadata_of_an_onnx_file(tmp_path, monkeypatch):
         import_policy(file, ForeignFiles(None, A1))
     deployment = import_policy(file, ForeignFiles(None, A1), settings={"control_dt": 0.02}).deployment
     assert deployment.action_scale == (0.25,) * 12
+    # Names are of terms here: what mjlab calls joint_pos are positions from the default pose.
+    assert all(part.relative for part in deployment.observations)
 
 
 def test_a_policy_acts_as_in_its_own_project(tmp_path, monkeypatch):
@@ -190,9 +197,11 @@ def test_columns_of_histories():
         (describe_walk(stiffness=[1.0]), 45, None, "stiffness has 1 numbers for 12 joints"),
         (describe_walk(stiffness=None), 45, None, "does not say: stiffness. Give --set stiffness=40"),
         (GYM, 47, {"stifness": 1}, "a deployment has no 'stifness'. Did you mean 'stiffness'"),
-        (LAB | {"observations": {"motion_command": {}}}, 48, None, "it tracks a motion"),
+        (LAB | {"observations": {"motion_command": {}}}, 24, None, "give the one it was trained with: --motion FILE"),
+        (LAB | {"observations": {"motion_anchor_pos_b": {}}}, 48, None, "observes motion_anchor_pos_b, which is not"),
         (LAB | {"observations": {"height_scan": {}}}, 48, None, "no known observation is 'height_scan'"),
         (LAB | {"joint_ids_map": [99] * 12}, 48, None, "joint_ids_map has the index 99, and there are 12 values"),
+        (describe_walk(), 45, {"observations": 5}, "observations"),
         ({"a": 1}, 45, None, "in none of the known forms"),
     ],
 )
@@ -202,14 +211,115 @@ def test_what_does_not_fit_is_a_line(run_import, content, size, settings, messag
     assert str(raised.value).count("\n") == 0
 
 
-@pytest.mark.parametrize("name", ["whole_body_tracking/motion_command", "RoboMimic_Deploy/phase"])
-def test_a_policy_of_rl_sar_that_tracks_a_motion(run_import, tmp_path, name):
+def test_a_policy_of_rl_sar_that_knows_its_phase_alone(run_import, tmp_path):
+    name = "RoboMimic_Deploy/phase"
     folder = tmp_path / "a1" / "dance"
     folder.mkdir(parents=True)
     write_yaml(tmp_path / "a1" / "base.yaml", {"a1": {"dt": 0.005, "decimation": 4, "joint_names": JOINTS}})
     content = {"a1/dance": SAR | {"observations": [name, *SAR["observations"]]}}
-    with pytest.raises(UsageError, match=f"observes {name}: it tracks a motion"):
+    with pytest.raises(UsageError, match=f"observes {name}, which is not imported"):
         run_import(content, 90, name="a1/dance/config.yaml")
+
+
+def write_clip(path, frames=40):
+    """Write a clip of the A1 at 50 Hz: it stands, and moves its front left hip."""
+    joints = np.tile(STANCE, (frames, 1))
+    joints[:, JOINTS.index("FL_hip_joint")] = 0.002 * np.arange(frames)
+    rows = np.hstack([np.tile([0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0], (frames, 1)), joints])
+    np.savetxt(path, rows, delimiter=",")
+    return path
+
+
+def test_a_policy_that_follows_a_clip(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "a1" / "dance"
+    folder.mkdir(parents=True)
+    write_yaml(tmp_path / "a1" / "base.yaml", {"a1": {"dt": 0.005, "decimation": 4, "joint_names": JOINTS}})
+    observed = ["motion_command", "motion_anchor_ori_b"]
+    content = SAR | {
+        "observations": [*(f"whole_body_tracking/{name}" for name in observed), "dof_pos"],
+        "observations_history": [],
+        "motion_file": "stand_50hz.csv",
+    }
+    deploy = write_yaml(folder / "config.yaml", {"a1/dance": content})
+    write_torchscript(tmp_path / "policy.pt", [42, 8, 12])
+    with pytest.raises(UsageError, match=r"--motion: no file .*stand_50hz\.csv"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1))
+    write_clip(folder / "stand_50hz.csv")
+    imported = import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1))
+    assert imported.deployment.anchor == "trunk"
+    assert any("anchor: the file does not name" in note for note in imported.notes)
+    spec = imported.policy.info.spec
+    assert spec.task == MOTION_TASK
+    spec = dataclasses.replace(spec, parameters={**spec.parameters, "random_start": False, "start_noise": 0.0})
+    with contextlib.closing(spec.make_worlds(1)) as worlds:
+        first = worlds.reset(np.arange(1), [0])[0]
+        second = worlds.step(np.zeros((1, 12), np.float32)).observation[0]
+    # SAR's joint_mapping exchanges the legs of each side: element 3 is joint 0 of the robot, FR_hip_joint.
+    hip = imported.deployment.joints.index("FL_hip_joint")
+    assert (first[hip], second[hip]) == (0.0, pytest.approx(0.002))  # [rad]
+    assert second[12 + hip] == pytest.approx(0.002 / 0.02)  # [rad/s]
+    assert first[24:30] == pytest.approx([1.0, 0.0, 0.0, 1.0, 0.0, 0.0], abs=1e-6)
+    assert deployed_in(tmp_path) == ["policy.safetensors", "stand_50hz.motion.csv"]
+
+
+def deployed_in(folder):
+    return sorted(path.name for path in folder.iterdir() if path.suffix in (".safetensors", ".csv"))
+
+
+def test_a_clip_in_the_graph(tmp_path, monkeypatch):
+    """A file of whole_body_tracking: joints in another order than the model's, links from the base on, w first."""
+    monkeypatch.chdir(tmp_path)
+    frames, joints = 20, JOINTS[::-1]
+    positions = np.tile(STANCE[::-1], (frames, 1))
+    positions[:, joints.index("FL_hip_joint")] = 0.01 * np.arange(frames)
+    tables = {
+        "joint_pos": positions,
+        "joint_vel": np.zeros((frames, 12)),
+        "body_pos_w": np.tile([0.0, 0.0, 0.3], (frames, 2, 1)),
+        "body_quat_w": np.tile([1.0, 0.0, 0.0, 0.0], (frames, 2, 1)),
+    }
+    listed = ",".join(["1.0"] * 12)
+    metadata = {
+        "joint_names": ",".join(joints),
+        "joint_stiffness": listed,
+        "joint_damping": listed,
+        "default_joint_pos": ",".join(map(str, STANCE[::-1])),
+        "action_scale": "0.25",
+        "command_names": "motion",
+        "observation_names": "command,motion_anchor_ori_b,joint_pos",
+        "anchor_body_name": "trunk",
+        "body_names": "trunk,FL_hip",
+    }
+    layer = ForeignLinear(np.zeros((12, 42)), np.zeros(12))
+    file = write_onnx(tmp_path / "jump.onnx", ForeignNetwork((layer,), "elu"), metadata=metadata)
+    add_clip(file, tables)
+    with pytest.raises(UsageError, match="does not say: control_dt"):
+        import_policy(file, ForeignFiles(None, A1))
+    imported = import_policy(file, ForeignFiles(None, A1), settings={"control_dt": 0.02})
+    assert imported.deployment.anchor == "trunk"
+    assert any("clip: 20 rows in jump.onnx, one per action" in note for note in imported.notes)
+    clip = read_motion(tmp_path / "jump.motion.csv")
+    assert clip.take_joints(["FL_hip_joint"])[:3, 0] == pytest.approx([0.0, 0.01, 0.02])
+    metadata["body_names"] = "FL_hip,trunk"
+    add_clip(write_onnx(file, ForeignNetwork((layer,), "elu"), metadata=metadata), tables)
+    with pytest.raises(UsageError, match=r"the base of a1\.urdf is trunk, which is not the first"):
+        import_policy(file, ForeignFiles(None, A1), settings={"control_dt": 0.02}, output=tmp_path / "b.safetensors")
+
+
+def test_a_clip_without_a_rate_or_for_another_policy(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_torchscript(tmp_path / "policy.pt", [24, 8, 12])
+    motion = LAB | {"observations": {"motion_command": {}}}
+    deploy, clip = write_yaml(tmp_path / "deploy.yaml", motion), write_clip(tmp_path / "stand.csv")
+    with pytest.raises(UsageError, match="no times and no rate; add --motion-rate 30"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1, motion=clip))
+    imported = import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1, motion=clip, motion_rate=50.0))
+    assert imported.deployment.follows_motion
+    write_torchscript(tmp_path / "walk.pt", [48, 8, 12])
+    walk = write_yaml(tmp_path / "walk.yaml", LAB)
+    with pytest.raises(UsageError, match="the policy observes no clip; leave out --motion stand"):
+        import_policy(tmp_path / "walk.pt", ForeignFiles(walk, A1, motion=clip, motion_rate=50.0))
 
 
 def test_an_imported_policy_is_not_trained_and_has_no_recipe(rlctl, tmp_path):

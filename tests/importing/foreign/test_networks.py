@@ -1,6 +1,7 @@
 """Networks of other projects are read as data, act as the originals, and are refused where they cannot."""
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from onnx import helper
@@ -9,7 +10,7 @@ from rlctl.errors import ArtifactError
 from rlctl.importing.foreign.network import ForeignLinear, ForeignNetwork
 from rlctl.importing.foreign.onnx_network import compute, read_onnx, step_lstm
 from rlctl.importing.foreign.torchscript import read_torchscript_network
-from tests.importing.foreign.policies import Concatenated, write_onnx, write_torchscript
+from tests.importing.foreign.policies import Concatenated, add_clip, write_onnx, write_torchscript
 
 
 @pytest.fixture
@@ -48,7 +49,10 @@ def test_the_means_of_a_distribution_are_what_acts(network, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"inputs": [("obs", [1, 5]), ("time_step", [1, 1])]}, r"2 inputs \(obs, time_step\).* plays a motion"),
+        (
+            {"inputs": [("obs", [1, 5]), ("time_step", [1, 1])]},
+            r"2 inputs \(obs, time_step\), expected one: the observation",
+        ),
         ({"inputs": [("obs", ["batch", "size"])]}, "the size of its input obs is dynamic"),
         ({"inputs": [("obs", [1, 5, 1])]}, "has 3 axes"),
         ({"extra": [helper.make_node("Fancy", ["y1"], ["actions"], domain="their.own")]}, "custom operator Fancy"),
@@ -93,6 +97,43 @@ def test_an_onnx_graph_with_hidden_states(tmp_path):
         with torch.no_grad():
             expected, hidden, cell = module(torch.tensor(row[None], dtype=torch.float32), hidden, cell)
         assert compute(network, own[0]) == pytest.approx(expected[0].numpy(), abs=1e-5)
+
+
+def test_actions_that_depend_on_the_row_of_a_clip(network, tmp_path):
+    extra = [helper.make_node("Add", ["y1", "time_step"], ["actions"])]
+    path = add_clip(write_onnx(tmp_path / "a.onnx", network, extra=extra), {"joint_pos": np.zeros((3, 2))})
+    with pytest.raises(ArtifactError, match="its actions depend on time_step") as raised:
+        read_onnx(path)
+    assert "\n" not in str(raised.value)
+
+
+def test_weights_in_a_file_next_to_the_graph(network, tmp_path):
+    path = tmp_path / "policy.onnx"
+    model = onnx.load(write_onnx(path, network))
+    onnx.save(model, path, save_as_external_data=True, location="policy.onnx.data", size_threshold=0)
+    assert path.with_name("policy.onnx.data").exists()
+    read, _ = read_onnx(path)
+    assert read.linears[0].weight == pytest.approx(network.linears[0].weight, abs=1e-6)
+    content = path.with_name("policy.onnx.data").read_bytes()
+    path.with_name("policy.onnx.data").write_bytes(content[:8])
+    with pytest.raises(ArtifactError, match=r"policy\.onnx\.data is too short"):
+        read_onnx(path)
+    path.with_name("policy.onnx.data").unlink()
+    with pytest.raises(ArtifactError, match=r"policy\.onnx\.data: no such file"):
+        read_onnx(path)
+
+
+def test_weights_in_any_other_file_are_not_read(network, tmp_path):
+    path = tmp_path / "policy.onnx"
+    model = onnx.load(write_onnx(path, network))
+    onnx.save(model, path, save_as_external_data=True, location="w.onnx.data", size_threshold=0)
+    model = onnx.load(path, load_external_data=False)
+    for place in ("/etc/passwd", "../w.onnx.data", "w.npz"):
+        model.graph.initializer[0].external_data[0].value = place
+        path.write_bytes(model.SerializeToString())
+        with pytest.raises(ArtifactError, match=r"only a file NAME\.onnx\.data next to it is read") as raised:
+            read_onnx(path)
+        assert "\n" not in str(raised.value)
 
 
 def test_text_is_no_graph(tmp_path):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import UsageError
-from rlctl.tasks.clip_options import ClipOptions
-from rlctl.tasks.motion_files import RobotJoints, read_clip
+from rlctl.task.clip_options import ClipOptions
+from rlctl.task.motion_files import RobotJoints, read_clip
 
 LOW, HIGH = np.array([-1.0, -0.5, -2.0, -2.0]), np.array([1.0, 0.5, 0.0, 0.0])
 NAMES = ["hip_joint", "ankle_joint", "left_elbow", "right_elbow"]

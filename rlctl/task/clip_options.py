@@ -1,4 +1,4 @@
-"""What a user says of the clips of `rlctl tasks new --motion`."""
+"""What a user says of clips: of those of `rlctl tasks new --motion`, and of that of an imported policy."""
 
 import dataclasses
 
@@ -11,3 +11,4 @@ class ClipOptions:
     quaternion: str | None = None
     joints: tuple[str, ...] = ()  # of the columns, in their order
     frames: str | None = None  # `FIRST:LAST`, counted from 0, LAST not included
+    rate_option: str = "--rate"  # what gives the rate, for messages

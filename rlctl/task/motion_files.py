@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from rlctl.errors import ArtifactError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files, untrusted
+from rlctl.task.clip_options import ClipOptions
 from rlctl.task.motion import MotionClip, find_rate
 from rlctl.task.rotations import normalize
-from rlctl.tasks.clip_options import ClipOptions
 
 Array = NDArray[np.float64]
 QuaternionOrder = Literal["xyzw", "wxyz"]
@@ -290,12 +290,14 @@ def _score_order(quaternions: Array, order: QuaternionOrder) -> float:
 
 def _choose_rate(path: Path, raw: _Raw, options: ClipOptions) -> tuple[float, str]:
     if options.rate is not None:
-        return options.rate, "--rate"
+        return options.rate, options.rate_option
     if raw.rate is not None and raw.rate > 0:
         return raw.rate, raw.rate_source
     if match := _RATE_IN_NAME.search(path.name):
         return float(match[1]), "its name"
-    raise UsageError(f"--motion {path}: the file has no times and no rate; add --rate 30, for frames per second")
+    raise UsageError(
+        f"--motion {path}: the file has no times and no rate; add {options.rate_option} 30, for frames per second"
+    )
 
 
 def _order_joints(path: Path, raw: _Raw, joints: RobotJoints, options: ClipOptions) -> tuple[Array, list[str]]:
