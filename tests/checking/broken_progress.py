@@ -67,7 +67,22 @@ class InBullet:
         return p.getEulerFromQuaternion(quaternion)[2]
 
 
+class TurnsBack:
+    """The way to the goal is turned by the yaw, and not back by it."""
+
+    def seen(self):
+        x, y = self.goal - self.place()
+        cosine, sine = np.cos(self.yaw()), np.sin(self.yaw())
+        return np.array([cosine * x - sine * y, cosine * y + sine * x])
+
+
 class FlyerSeeks(Seeks, Flyer): ...
+
+
+class RL125FlyerTurnsBack(TurnsBack, FlyerSeeks): ...
+
+
+class RL125CartTurnsBack(TurnsBack, Seeks, Cart): ...
 
 
 class RL622FlyerGoesAway(GoesAway, FlyerSeeks): ...
@@ -84,16 +99,25 @@ class HopperSeeks(Seeks, MujocoHopper):
         return self.attitude().as_euler("xyz")[2]
 
 
+class RL125HopperTurnsBack(TurnsBack, HopperSeeks): ...
+
+
 class RL622HopperGoesAway(GoesAway, HopperSeeks): ...
 
 
 class CrawlerSeeks(InBullet, Seeks, CrawlerLooks): ...
 
 
+class RL125CrawlerTurnsBack(InBullet, TurnsBack, Seeks, CrawlerLooks): ...
+
+
 class RL622CrawlerGoesAway(GoesAway, CrawlerSeeks): ...
 
 
 class PuckSeeks(InBullet, Seeks, Puck): ...
+
+
+class RL125PuckTurnsBack(InBullet, TurnsBack, Seeks, Puck): ...
 
 
 class RL622PuckGoesAway(GoesAway, PuckSeeks): ...

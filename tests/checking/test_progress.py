@@ -1,4 +1,4 @@
-"""RL622: goals that go away and pay, and success that costs, in robots that see the goal in their own frame."""
+"""RL622: goals that go away and pay, success that costs; RL125: goals turned the wrong way. On robots that turn."""
 
 import pytest
 
@@ -9,7 +9,7 @@ pytest.importorskip("mujoco")
 
 def broken(name, twin, **settings):
     file = "broken_progress.py"
-    return case(f"{file}:{name}", ("RL622", "warning"), twin=f"{file}:{twin}", **settings)
+    return case(f"{file}:{name}", (name[:5], "warning"), twin=f"{file}:{twin}", **settings)
 
 
 CASES = [
@@ -24,6 +24,11 @@ CASES = [
     broken("RL622CartCostsSuccess", "CartPaysSuccess"),
     broken("RL622CrawlerCostsSuccess", "CrawlerPaysSuccess", pybullet=True),
     broken("RL622PuckCostsSuccess", "PuckPaysSuccess", pybullet=True),
+    broken("RL125FlyerTurnsBack", "FlyerSeeks"),
+    broken("RL125CartTurnsBack", "CartSeeks"),
+    broken("RL125HopperTurnsBack", "HopperSeeks"),
+    broken("RL125CrawlerTurnsBack", "CrawlerSeeks", pybullet=True),
+    broken("RL125PuckTurnsBack", "PuckSeeks", pybullet=True),
 ]
 
 

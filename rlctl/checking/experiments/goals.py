@@ -190,20 +190,24 @@ class GoalEpisode:
         return read_place(source, self.observed[None], self.goal[None])[0]
 
     def _read_turned(self, element: int) -> Numbers:
-        """Play the same steps again with the goal of the last one shifted, which shows how the robot is turned."""
         key = element, self._seed, self._actions, len(self._goals)
         if key not in self._trials.turned_places:
-            parts = []
-            # The last one leaves the environment as this episode did.
-            for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
-                again = GoalEpisode(self._trials, self._seed, self._actions)
-                again.play([*self._goals[:-1], self.goal + shift])
-                parts.append(again.observed[element : element + self.goal.size])
-            *shifted, plain = parts
-            turn = np.stack(shifted, axis=1) - plain[:, None]
-            way, *_ = np.linalg.lstsq(turn / TURN_SHIFT, plain, rcond=None)
+            part = self.observed[element : element + self.goal.size]
+            way, *_ = np.linalg.lstsq(self.read_turn(element), part, rcond=None)
             self._trials.turned_places[key] = self.goal - way
         return self._trials.turned_places[key]
+
+    def read_turn(self, element: int) -> Numbers:
+        """Return how the observation turns the way to the goal, after a step. Shape (size, size). The same steps are
+        played again with the goal of the last one shifted."""
+        parts = []
+        # The last one leaves the environment as this episode did.
+        for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
+            again = GoalEpisode(self._trials, self._seed, self._actions)
+            again.play([*self._goals[:-1], self.goal + shift])
+            parts.append(again.observed[element : element + self.goal.size])
+        *shifted, plain = parts
+        return (np.stack(shifted, axis=1) - plain[:, None]) / TURN_SHIFT
 
     def measure_distance(self, source: Source) -> float:
         """Return how far the goal is from the robot by a source."""
