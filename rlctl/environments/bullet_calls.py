@@ -1,5 +1,6 @@
 """Records how an environment calls PyBullet: which calls leave physicsClientId out."""
 
+import collections
 import contextlib
 import dataclasses
 import inspect
@@ -111,6 +112,7 @@ class BulletCalls:
         self.search_paths: list[str] = []
         self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
         self.after_step: Callable[[int], None] | None = None  # and after it
+        self.steps: collections.Counter[int] = collections.Counter()  # calls of stepSimulation by client
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -264,8 +266,11 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
             if is_step and calls.before_step is not None:
                 calls.before_step(_read_client(arguments, keywords))
             result = function(*arguments, **keywords)
-            if is_step and calls.after_step is not None:
-                calls.after_step(_read_client(arguments, keywords))
+            if is_step:
+                client = _read_client(arguments, keywords)
+                calls.steps[client] += 1
+                if calls.after_step is not None:
+                    calls.after_step(client)
             if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result

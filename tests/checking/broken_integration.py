@@ -1,10 +1,12 @@
-"""Robots that are moved by their own velocity, as the engine has done already, and twins that are moved on purpose."""
+"""Robots that are moved by their own velocity, as the engine has done already, and twins that are moved on purpose; and
+robots that measure their velocity over a step."""
 
 import numpy as np
 import pybullet as p
-from broken_turned import Cart, Flyer
+from broken_turned import Cart, CrawlerLooks, Flyer, Puck
 from mujoco_robots import MujocoArm, MujocoHopper
 from robots import Arm, Crawler, Pusher
+from scipy.spatial.transform import Rotation
 
 
 class Twice:
@@ -89,3 +91,95 @@ class RL823CartIsPushed(Cart):
             self.data.qvel[:2] += 0.3
         if abs(self.data.qpos[0]) > 0.05:
             self.data.qpos[0] = 0.0
+
+
+class Measures:
+    """It sees its velocity, from its place one step before, in its own frame."""
+
+    last = None
+
+    def start(self):
+        super().start()
+        self.last = None
+
+    def measured(self, place, turn):
+        place = np.array(place)
+        way = np.zeros(3) if self.last is None else place - self.last
+        self.last = place
+        return turn.inv().apply(way) / self.time()
+
+
+class PerPhysicsStep:
+    def time(self):
+        return self.physics_step
+
+
+class MeasuresInMujoco(Measures):
+    physics_step = 0.005
+
+    def time(self):
+        return self.physics_step * self.frames
+
+    def observe(self):
+        velocity = self.measured(self.data.qpos[:3], self.turn())
+        return np.concatenate([self.turn().as_matrix()[0], velocity, self.data.qvel[3:6]])
+
+
+class FlyerMeasures(MeasuresInMujoco, Flyer): ...
+
+
+class RL820FlyerMeasures(PerPhysicsStep, FlyerMeasures): ...
+
+
+class CartMeasures(MeasuresInMujoco, Cart): ...
+
+
+class RL820CartMeasures(PerPhysicsStep, CartMeasures): ...
+
+
+class MeasuresInBullet(Measures):
+    physics_step, steps_of_physics = 1 / 120, 4
+
+    def time(self):
+        return self.physics_step * self.steps_of_physics
+
+    def size(self):
+        return 6
+
+    def observe(self):
+        place, quaternion = p.getBasePositionAndOrientation(self.robot, physicsClientId=self.client)
+        turn = Rotation.from_quat(quaternion)
+        return np.concatenate([turn.as_matrix()[0], self.measured(place, turn)]).astype(np.float32)
+
+
+class PuckMeasures(MeasuresInBullet, Puck):
+    physics_step, steps_of_physics = 1 / 240, 8
+
+
+class RL820PuckMeasures(PerPhysicsStep, PuckMeasures): ...
+
+
+class CrawlerMeasures(MeasuresInBullet, CrawlerLooks): ...
+
+
+class RL820CrawlerMeasures(PerPhysicsStep, CrawlerMeasures): ...
+
+
+class PusherMeasures(Measures, Pusher):
+    """It sees how fast its cube slides, in the world's frame."""
+
+    physics_step = 1 / 120
+
+    def time(self):
+        return 4 * self.physics_step
+
+    def size(self):
+        return super().size() + 3
+
+    def observe(self):
+        place, _ = p.getBasePositionAndOrientation(self.cube, physicsClientId=self.client)
+        velocity = self.measured(place, Rotation.identity())
+        return np.concatenate([super().observe(), velocity]).astype(np.float32)
+
+
+class RL820PusherMeasures(PerPhysicsStep, PusherMeasures): ...

@@ -1,4 +1,4 @@
-"""RL823: what the environment moves by its own velocity is found in robots that differ, in both engines."""
+"""RL823: what the environment moves by its own velocity; RL820: velocities over the wrong time. In both engines."""
 
 import pytest
 
@@ -8,7 +8,11 @@ pytest.importorskip("mujoco")
 
 
 def broken(name, twin, **settings):
-    return case(f"broken_integration.py:{name}", ("RL823", "warning"), twin=twin, **settings)
+    return case(f"broken_integration.py:{name}", (name[:5], "warning"), twin=twin, **settings)
+
+
+def measures(robot, **settings):
+    return broken(f"RL820{robot}Measures", f"broken_integration.py:{robot}Measures", slow=True, **settings)
 
 
 CART, BELT = "broken_integration.py:RL823CartIsPushed", "broken_integration.py:RL823PusherWithABelt"
@@ -20,6 +24,11 @@ CASES = [
     broken("RL823BulletArmTwice", "robots.py:Arm", pybullet=True),
     broken("RL823PusherTwice", BELT, pybullet=True),
     broken("RL823CrawlerTwice", "robots.py:Crawler", pybullet=True),
+    measures("Flyer"),
+    measures("Cart"),
+    measures("Puck", pybullet=True),
+    measures("Crawler", pybullet=True),
+    measures("Pusher", pybullet=True),
 ]
 
 

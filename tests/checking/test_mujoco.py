@@ -83,6 +83,12 @@ def test_clean_is_clean(task):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["ArmPalmMustNotTouch", "HopperFalls"])
+def test_a_part_that_must_not_touch_is_no_wrong_part(name):
+    assert found(f"broken_mujoco.py:{name}", "RL812") == set()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rule", "words"),
     [
