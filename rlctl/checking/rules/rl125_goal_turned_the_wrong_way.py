@@ -1,7 +1,8 @@
 """RL125: goal turned the wrong way."""
 
+import collections
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,14 @@ EPISODES, MOST_EPISODES = 4, 8  # that have to show it, and that are played
 SAME, LEAST_TURN = 3e-3, 0.2  # of the elements of rotation matrices; of a rotation and its inverse
 
 
+class _Frame(NamedTuple):
+    """A free body."""
+
+    name: str
+    client: int
+    body: int
+
+
 @judges_goals(RULE)
 def _find_turned_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     """Compare how the observation turns the way to the goal with how the engine has turned what moves."""
@@ -51,22 +60,22 @@ def _find_turned_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
 def _find_wrong_frame(trials: GoalTrials, element: int) -> str:
     """Return what has turned the way to the goal the wrong way in several episodes, in which it was turned enough to
     tell; empty if it is in the frame of anything, or there are too few."""
-    counts: dict[str, int] = {}
-    others: set[str] = set()
+    counts: collections.Counter[_Frame] = collections.Counter()
+    others: set[_Frame] = set()
     for seed in range(FIRST_SEED, FIRST_SEED + MOST_EPISODES):
         episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
         if episode.has_ended:
             continue
         turn = episode.read_turn(element)
-        for name, quaternion in _read_orientations(trials.instance.env).items():
+        for frame, quaternion in _read_orientations(trials.instance.env).items():
             matrices = [m for m in _list_turns(quaternion, len(turn)) if np.abs(m - m.T).max() >= LEAST_TURN]
             if any(_is_same_turn(turn, matrix.T) for matrix in matrices):
                 return ""
             if any(_is_same_turn(turn, matrix) for matrix in matrices):
-                counts[name] = counts.get(name, 0) + 1
+                counts[frame] += 1
             elif matrices:
-                others.add(name)
-    return next((name for name, count in counts.items() if count >= EPISODES and name not in others), "")
+                others.add(frame)
+    return next((frame.name for frame, count in counts.items() if count >= EPISODES and frame not in others), "")
 
 
 def _is_same_turn(turn: Array, matrix: Array) -> bool:
@@ -82,16 +91,19 @@ def _list_turns(quaternion: Array, size: int) -> list[Array]:
     return [level, matrix] if size == 3 else [level[:size, :size]]
 
 
-def _read_orientations(env: Any) -> dict[str, Array]:
-    """Return the quaternions, x, y, z, w, of free bodies by their names."""
-    readers: list[tuple[World, Poses]] = []
+def _read_orientations(env: Any) -> dict[_Frame, Array]:
+    """Return the quaternions, x, y, z, w, of free bodies."""
+    worlds: list[tuple[World, Poses]] = []
     if (simulation := find_mujoco(env)) is not None:
         reader = MujocoStateReader(*simulation)
         reader.update()
-        readers.append((reader.world, reader.read_poses()))
-    for client in find_clients():
+        worlds.append((reader.world, reader.read_poses()))
+    for client in find_clients():  # others may be connected that other instances have
         world = read_world(client)
-        readers.append((world, read_poses(world)))
+        worlds.append((world, read_poses(world)))
     return {
-        body.name: poses[body.id, -1][ORIENTATION] for world, poses in readers for body in world.bodies if body.is_free
+        _Frame(body.name, world.client, body.id): poses[body.id, -1][ORIENTATION]
+        for world, poses in worlds
+        for body in world.bodies
+        if body.is_free
     }

@@ -56,6 +56,8 @@ class _Outcome:
 
 _MeasureAxis = Callable[[GoalTrials, Source, int, int, _Outcome], Sequence[float]]
 """Returns rewards that show something wrong along an axis in an episode, or nothing."""
+_Describe = Callable[[GoalTrials, Sequence[int], Sequence[float]], RuleFinding]
+"""Describes what is wrong along some axes, by these rewards."""
 
 
 @judges_goals(RULE)
@@ -73,9 +75,14 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         yield Skipped(RULE.id, "no goal next to the robot was a success in several episodes")
         return
     moved = np.ptp(np.array([inside.place for inside in insides.values()]), axis=0) > FEWEST_MOVED * trials.range
-    for measure, describe in ((_measure_sides, _describe_distance), (_measure_ways, _describe_way)):
+    looks: list[tuple[_MeasureAxis, _Describe]] = [
+        (_measure_sides, _describe_distance),
+        (_measure_ways, _describe_way),
+    ]
+    for measure, describe in looks:
         axes, shown = _find_axes(trials, source, insides, measure)
-        if axes := [axis for axis in axes if moved[axis]]:
+        axes = [axis for axis in axes if moved[axis]]
+        if axes:
             yield describe(trials, axes, shown)
             return
 
@@ -96,7 +103,8 @@ def _find_axes(
     trials: GoalTrials, source: Source, insides: Mapping[int, _Outcome], measure: _MeasureAxis
 ) -> tuple[list[int], Sequence[float]]:
     """Return the axes along which something wrong is measured in all episodes, and rewards that show it."""
-    axes, shown = list(range(trials.goals.shape[1])), ()
+    axes = list(range(trials.goals.shape[1]))
+    shown: Sequence[float] = ()
     for number, inside in insides.items():
         wrong = {axis: measure(trials, source, number, axis, inside) for axis in axes}
         axes = [axis for axis in axes if wrong[axis]]

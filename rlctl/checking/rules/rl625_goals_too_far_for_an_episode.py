@@ -82,11 +82,14 @@ def _trace(trials: GoalTrials, source: Source, seed: int, actions: str, most_ste
     place if it succeeds."""
     if source[1] == TURNED:
         return _trace_turned(trials, source, seed, actions, most_steps)
-    episode, places = GoalEpisode(trials, seed, actions), []
+    episode = GoalEpisode(trials, seed, actions)
+    places: list[Numbers] = []
     while not episode.has_ended and len(places) < most_steps:
         episode.step()
         places.append(episode.read(source))
-    return np.array([] if episode.has_succeeded else places), episode.has_ended
+    if episode.has_succeeded:
+        places = []
+    return np.array(places), episode.has_ended
 
 
 def _trace_turned(trials: GoalTrials, source: Source, seed: int, actions: str, most_steps: int) -> tuple[Numbers, bool]:
@@ -96,7 +99,8 @@ def _trace_turned(trials: GoalTrials, source: Source, seed: int, actions: str, m
     anchors = trials.goals.mean(axis=0) + FAR * trials.range.max() * np.vstack([np.eye(size), -np.ones(size)])
     squares = []
     for anchor in anchors:
-        episode, distances = GoalEpisode(trials, seed, actions), []
+        episode = GoalEpisode(trials, seed, actions)
+        distances: list[float] = []
         while not episode.has_ended and len(distances) < most_steps:
             episode.step(anchor)
             distances.append(episode.measure_distance(source))

@@ -10,6 +10,7 @@ import numpy as np
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.instance import EnvironmentRaised
+from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld
@@ -128,8 +129,7 @@ def _play(watched: WatchedWorlds, moves: list[_Moves]) -> None:
                     one.begin()
     finally:
         calls.before_step = calls.after_step = None
-        quiet = type(mujoco_calls)
-        mujoco_calls.before_step, mujoco_calls.after_step = quiet.before_step, quiet.after_step
+        mujoco_calls.before_step, mujoco_calls.after_step = MujocoCalls.before_step, MujocoCalls.after_step
 
 
 def _read(reader: StateReader) -> Array:
