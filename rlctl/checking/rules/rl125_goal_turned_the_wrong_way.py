@@ -32,7 +32,7 @@ RULE = Rule(
 )
 
 EPISODES, MOST_EPISODES = 4, 8  # that have to show it, and that are played
-SAME, LEAST_TURN = 3e-3, 0.2  # of the elements of rotation matrices; of a rotation and its inverse
+SAME, LEAST_TURN = 0.01, 0.2  # of the elements of rotation matrices; of a rotation and its inverse
 
 
 class _Frame(NamedTuple):
