@@ -231,8 +231,9 @@ class BulletStateReader:
         return read_physics(self.world.client)
 
     def read_time(self) -> float:
-        """See `StateReader`."""
-        return math.nan
+        """See `StateReader`; from the calls of stepSimulation that were recorded."""
+        step_s = float(ClientCalls(self.world.client).getPhysicsEngineParameters()["fixedTimeStep"])
+        return self._calls.steps[self.world.client] * step_s
 
     def read_failure(self) -> str:
         """See `StateReader`; PyBullet reports nothing."""

@@ -50,7 +50,7 @@ class WorldLog:
     world: World
     actions: str  # The kind of the episode's actions
     places: list[Place] = dataclasses.field(default_factory=list)
-    times: list[float] = dataclasses.field(default_factory=list)  # simulated [s]; NaN in PyBullet
+    times: list[float] = dataclasses.field(default_factory=list)  # simulated [s]
     states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
     overlaps: dict[Pair, tuple[float, float]] = dataclasses.field(default_factory=dict)

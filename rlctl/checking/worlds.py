@@ -159,7 +159,7 @@ class StateReader(Protocol):
         """Return the gravity [m/s^2], and how long one step of the physics is [s]."""
 
     def read_time(self) -> float:
-        """Return how long was simulated [s]; NaN where the engine does not tell."""
+        """Return how long was simulated [s]."""
 
     def read_failure(self) -> str:
         """Return what the engine itself says is wrong with the simulation; empty for nothing."""

@@ -1,5 +1,6 @@
 """Records how an environment calls PyBullet: which calls leave physicsClientId out."""
 
+import collections
 import contextlib
 import dataclasses
 import inspect
@@ -110,6 +111,8 @@ class BulletCalls:
         self.models: dict[tuple[int, int], str] = {}  # the file of a URDF, by client and body
         self.search_paths: list[str] = []
         self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
+        self.after_step: Callable[[int], None] | None = None  # and after it
+        self.steps: collections.Counter[int] = collections.Counter()  # calls of stepSimulation by client
         self._known: set[tuple[CodeType, int]] = set()
 
     def note_call(self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any]) -> None:
@@ -222,6 +225,11 @@ def _read_arguments(frame: FrameType) -> str:
     return "".join(lines).partition("(")[2]
 
 
+def _read_client(arguments: Sequence[Any], keywords: Mapping[str, Any]) -> int:
+    """Return the client of a function whose only argument it is."""
+    return int(keywords.get("physicsClientId", arguments[0] if arguments else 0))
+
+
 class Replacement:
     """Takes the place of a function of PyBullet."""
 
@@ -254,9 +262,15 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
         def call(self: Any, *arguments: Any, **keywords: Any) -> Any:
             frame = sys._getframe(1)
             calls.note_call(name, frame, arguments, keywords)
-            if name == "stepSimulation" and calls.before_step is not None:
-                calls.before_step(int(keywords.get("physicsClientId", arguments[0] if arguments else 0)))
+            is_step = name == "stepSimulation"
+            if is_step and calls.before_step is not None:
+                calls.before_step(_read_client(arguments, keywords))
             result = function(*arguments, **keywords)
+            if is_step:
+                client = _read_client(arguments, keywords)
+                calls.steps[client] += 1
+                if calls.after_step is not None:
+                    calls.after_step(client)
             if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result

@@ -196,18 +196,28 @@ class RL812HopperThighs(MujocoHopper):
 class RL812ArmTouchesWithPalm(MujocoArm):
     rlctl_ignore = {"RL611": "a consequence"}
     home = np.array([1.6, 1.2, 0.3])
-    part = "palm"
+    part, weight = "palm", 1.0
 
     def __init__(self):
         super().__init__()
         self.part_id = self.model.geom(self.part).id
 
     def reward(self):
-        return super().reward() - 1.0 * any(self.part_id in contact.geom for contact in self.data.contact)
+        return super().reward() + self.weight * any(self.part_id in contact.geom for contact in self.data.contact)
 
 
 class RL812ArmTouchesWithFinger(RL812ArmTouchesWithPalm):
     part = "finger"
+
+
+class ArmPalmMustNotTouch(RL812ArmTouchesWithPalm):
+    weight = -1.0
+
+
+class HopperFalls(MujocoHopper):
+    """It sees whether its trunk touches the ground, and not whether its feet do."""
+
+    soles = ("box",)
 
 
 # RL815

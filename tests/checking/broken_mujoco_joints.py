@@ -2,6 +2,7 @@
 
 import mujoco
 import numpy as np
+from broken_turned import Cart
 from mujoco_robots import ARM, MujocoArm, MujocoHopper
 
 # RL804
@@ -46,6 +47,49 @@ class RL816ArmIncrementsTooFar(ArmIncrements):
 
     rlctl_ignore = {"RL611": "hard to find"}
     low, high = np.array([-1.04, -2.96, -2.96]), np.array([2.61, 2.96, 2.96])
+
+
+class CartSpeedsUp(Cart):
+    """Each action changes the torques of its wheels, which are kept."""
+
+    def start(self):
+        super().start()
+        self.torques = np.zeros(2)
+
+    def change(self, action):
+        self.torques = np.clip(self.torques + 0.05 * action, -1.0, 1.0)
+
+    def move(self, action):
+        self.change(action)
+        super().move(self.torques)
+
+
+class RL816CartSpeedsUpTooFar(CartSpeedsUp):
+    def change(self, action):
+        self.torques = self.torques + 0.05 * action
+
+
+class HopperPushes(MujocoHopper):
+    """Each action changes the torques of its legs, which are kept."""
+
+    most = 12.0
+
+    def start(self):
+        super().start()
+        self.kept = np.zeros(6)
+
+    def torques(self, action):
+        self.kept = np.clip(self.kept + 1.0 * action, -self.most, self.most)
+        return self.kept
+
+    def move(self, action):
+        self.data.ctrl[:] = self.torques(action)
+        mujoco.mj_step(self.model, self.data, nstep=self.frames)
+        self.forward()
+
+
+class RL816HopperPushesTooFar(HopperPushes):
+    most = 1e3
 
 
 class ArmFollowsMeasured(ArmIncrements):

@@ -404,3 +404,41 @@ class RL821CrawlerDriven(RL821CrawlerHeldByMotors):
     def load(self):
         super().load()
         self.release()
+
+
+class Increments:
+    """Each action changes the targets of the joints, which are kept and stay within the limits."""
+
+    most = 1.0
+
+    def start(self):
+        self.targets = np.array(self.home)
+        super().start()
+
+    def target(self, action):
+        infos = [p.getJointInfo(self.robot, joint, physicsClientId=self.client) for joint in range(3)]
+        low, high = np.array([info[8:10] for info in infos]).T
+        self.targets = np.clip(self.targets + 0.3 * action, self.most * low, self.most * high)
+        return self.targets
+
+
+class TooFar(Increments):
+    most = 1e3
+
+
+class ArmIncrements(Increments, Arm): ...
+
+
+class ArmIncrementsTooFar(TooFar, Arm): ...
+
+
+class CrawlerIncrements(Increments, Crawler): ...
+
+
+class CrawlerIncrementsTooFar(TooFar, Crawler): ...
+
+
+class PusherIncrements(Increments, Pusher): ...
+
+
+class PusherIncrementsTooFar(TooFar, Pusher): ...

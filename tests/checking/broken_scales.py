@@ -2,6 +2,7 @@
 
 import numpy as np
 from broken_meaning import Drone, Rover
+from broken_progress import BoatSeeks, CartSeeks, FlyerSeeks, PuckSeeks
 from broken_reach import Arm as Reach
 from broken_reach_bullet import Reacher
 from mujoco_robots import MujocoArm, MujocoHopper
@@ -27,6 +28,23 @@ class RL625ReachOnePercent(Reach):
 class RL625RoverOnePercent(Rover):
     def move(self, action):
         super().move(0.01 * action)
+
+
+class OnePercent:
+    def move(self, action):
+        super().move(0.01 * action)
+
+
+class RL625BoatOnePercent(OnePercent, BoatSeeks): ...
+
+
+class RL625FlyerOnePercent(OnePercent, FlyerSeeks): ...
+
+
+class RL625CartOnePercent(OnePercent, CartSeeks): ...
+
+
+class RL625PuckOnePercent(OnePercent, PuckSeeks): ...
 
 
 class RL706BulletArmOnePercent(Arm):

@@ -61,6 +61,8 @@ CASES = [
     broken_joints("RL811ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error", slow=True),
     broken_joints("RL811HopperIncrementsInOtherOrder", "RL811", "RL811HopperIncrements", "error", slow=True),
     broken_joints("RL816ArmIncrementsTooFar", "RL816", "ArmIncrements", slow=True),
+    broken_joints("RL816CartSpeedsUpTooFar", "RL816", "CartSpeedsUp", slow=True),
+    broken_joints("RL816HopperPushesTooFar", "RL816", "HopperPushes", slow=True),
     broken_joints("RL119HopperInDegrees", "RL119", "HopperObserves", slow=True),
     broken_joints("RL819HopperSpeedsInOtherOrder", "RL819", "HopperObserves", slow=True),
     broken_joints("RL820ArmVelocityOfSubsteps", "RL820", "RL820ArmVelocity", slow=True),
@@ -78,6 +80,12 @@ def test_finds_the_mistake_and_only_that(case):
 @pytest.mark.parametrize("task", [*CLEAN, IN_DEGREES])
 def test_clean_is_clean(task):
     assert found(task, "RL119", *rules_of("RL8")) == set()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ArmPalmMustNotTouch", "HopperFalls"])
+def test_a_part_that_must_not_touch_is_no_wrong_part(name):
+    assert found(f"broken_mujoco.py:{name}", "RL812") == set()
 
 
 @pytest.mark.slow

@@ -49,6 +49,9 @@ CASES = [
     broken("RL815ArmOldHand", "RL815", "info", "Arm"),
     broken("RL815PusherOldCube", "RL815", "warning", "Pusher"),
     broken("RL815CrawlerOldFoot", "RL815", "info", "RL815CrawlerFoot"),
+    broken("ArmIncrementsTooFar", "RL816", "warning", "ArmIncrements"),
+    broken("CrawlerIncrementsTooFar", "RL816", "warning", "CrawlerIncrements"),
+    broken("PusherIncrementsTooFar", "RL816", "warning", "PusherIncrements"),
     case(
         "broken_robots.py:RL821CrawlerHeldByMotors",
         *(("RL821", "error"), ("RL701", "info")),  # what its motors do is chance

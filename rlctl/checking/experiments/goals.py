@@ -24,17 +24,21 @@ MOST_CANDIDATES = 6
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
 ROUNDING, PART = 1e-5, 5e-7  # of observations to float32, and of large ones
+MOST_NOISE = 2e-4  # of elements, from an episode to the same one again
 COMPARED = 4  # resets after which the places of links are compared with the observation
 SMALLER_UNITS = (100.0, 1000.0)  # times as many of them [cm, mm]
 SCALED_GOAL = "goal in a smaller unit"
 NEAR = 2e-3  # how near they are [m]
-PLACED_EPISODES = 3
+PLACED_EPISODES, MOST_PLACED_EPISODES = 3, 8  # that are needed, and that are tried
 PLACED_STEPS = 3  # after which a goal is put at the place of the robot
 STARTS_COMPARED = 9
 MOST_SOURCES = 24  # places in the observation at which it is put
 Numbers = NDArray[np.float64]
 Source = tuple[int, int]
-"""The element of an observation from which on it has a place, and the sign with which the goal is in it, or 0."""
+"""The element of an observation from which on it has a place, and the sign with which the goal is in it; 0 for a place
+by itself, and `TURNED` for the way to the goal in the frame of a robot that turns."""
+TURNED = 2
+TURN_SHIFT, TURN_ERROR = 0.1, 1e-3  # of a goal along each axis, to see how the observation turns it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +47,7 @@ class DrawnGoal:
 
     name: str  # of the attribute
     copies: Sequence[Source]  # Where the observation has it, or its difference to something
+    turned: Sequence[Source]  # Where the observation has its difference to something, turned
     goals: Mapping[int, Sequence[float]]  # by seed
     reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
 
@@ -71,6 +76,8 @@ class GoalTrials:
 
     instance: Instance
     drawn: DrawnGoal
+    turned_places: dict[tuple[int, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
+    """Where the robot is by a turned source, by its element, seed, kind of actions and steps: goals move no robot."""
 
     @functools.cached_property
     def goals(self) -> Numbers:
@@ -87,19 +94,29 @@ class GoalTrials:
         """Where the observation has the place at which a goal is a success."""
         episode = GoalEpisode(self, FIRST_SEED, "repeated", PLACED_STEPS)
         reports_success = not episode.has_ended and episode.step().succeeds is not None
-        sources = find_sources(self.drawn.copies, episode.observed[None], episode.goal[None])
-        for source in sources[:MOST_SOURCES] if reports_success else ():
+        for source in self.list_sources(episode)[:MOST_SOURCES] if reports_success else ():
             if self.is_success_at(source):
                 return AtGoal(source, reports_success)
         return AtGoal(None, reports_success)
 
+    def list_sources(self, episode: "GoalEpisode") -> list[Source]:
+        """Return where the observation may have the place of the robot: relative to the goal, and then by itself."""
+        plain = find_sources(self.drawn.copies, episode.observed[None], episode.goal[None])
+        return [*self.drawn.turned, *plain]
+
     def is_success_at(self, source: Source) -> bool:
         """Say whether a goal at a place of the observation is a success, in several episodes."""
-        for seed in range(FIRST_SEED, FIRST_SEED + PLACED_EPISODES):
+        tried = 0
+        for seed in range(FIRST_SEED, FIRST_SEED + MOST_PLACED_EPISODES):
             place = self.find_place(source, seed)
-            if place is None or not self.succeeds(seed, place):
+            if place is None:  # it ends, or succeeds, too early
+                continue
+            if not self.succeeds(seed, place):
                 return False
-        return True
+            tried += 1
+            if tried == PLACED_EPISODES:
+                return True
+        return False
 
     def find_place(self, source: Source, seed: int) -> Numbers | None:
         """Return what is a place by a source, after a few steps with the action that the seed draws; None if the
@@ -138,6 +155,8 @@ class GoalEpisode:
 
     def __init__(self, trials: GoalTrials, seed: int, actions: str = "zero", first: int = 0) -> None:
         """Reset, and play the first steps with the goal that was drawn; `actions` is a kind of `draw_actions`."""
+        self._trials, self._seed, self._actions = trials, seed, actions
+        self._goals: list[Numbers | None] = []  # by step
         self._instance = trials.instance
         self._player = EpisodePlayer(self._instance, seed, actions)
         moment = self._player.reset()
@@ -157,6 +176,7 @@ class GoalEpisode:
         if goal is not None:
             self._attribute.assign(shape_like(self._attribute.value, goal))
             self.goal = goal
+        self._goals.append(goal)
         moment = self._player.step()
         self.observed = flatten_floats(self._instance.leaves, moment.observation)
         succeeds = _read_success(moment)
@@ -164,8 +184,37 @@ class GoalEpisode:
         return GoalStep(moment.reward_number, succeeds)
 
     def read(self, source: Source) -> Numbers:
-        """Return the place of the robot by a source. Shape (size,)."""
+        """Return the place of the robot by a source, after a step. Shape (size,)."""
+        if source[1] == TURNED:
+            return self._read_turned(source[0])
         return read_place(source, self.observed[None], self.goal[None])[0]
+
+    def _read_turned(self, element: int) -> Numbers:
+        key = element, self._seed, self._actions, len(self._goals)
+        if key not in self._trials.turned_places:
+            part = self.observed[element : element + self.goal.size]
+            way, *_ = np.linalg.lstsq(self.read_turn(element), part, rcond=None)
+            self._trials.turned_places[key] = self.goal - way
+        return self._trials.turned_places[key]
+
+    def read_turn(self, element: int) -> Numbers:
+        """Return how the observation turns the way to the goal, after a step. Shape (size, size). The same steps are
+        played again with the goal of the last one shifted."""
+        parts = []
+        # The last one leaves the environment as this episode did.
+        for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
+            again = GoalEpisode(self._trials, self._seed, self._actions)
+            again.play([*self._goals[:-1], self.goal + shift])
+            parts.append(again.observed[element : element + self.goal.size])
+        *shifted, plain = parts
+        return (np.stack(shifted, axis=1) - plain[:, None]) / TURN_SHIFT
+
+    def measure_distance(self, source: Source) -> float:
+        """Return how far the goal is from the robot by a source."""
+        element, sign = source
+        if sign:
+            return float(np.linalg.norm(self.observed[element : element + self.goal.size]))
+        return float(np.linalg.norm(self.read(source) - self.goal))
 
     def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
         """Take a step for each goal; less if the episode ends."""
@@ -195,14 +244,15 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
         raise NotJudged("reset takes no seed (RL202)")
     names, by_chance = _find_drawn(instance)
     for name in names:
-        if copies := _find_copies(instance, name):
+        copies, turned = _find_copies(instance, name), _find_turned(instance, name)
+        if copies or turned:
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
                 if context.budget.why_spent():
                     break
                 instance.reset(seed)
                 goals[seed] = read_attributes(instance.env)[name].numbers.tolist()
-            drawn = DrawnGoal(name, copies, goals, _find_reaches(instance, name, copies))
+            drawn = DrawnGoal(name, copies, turned, goals, _find_reaches(instance, name, copies))
             yield Fact("goals", drawn)
             yield from judges_goals.judge(GoalTrials(instance, drawn))
             return
@@ -252,23 +302,43 @@ def _is_place(one: Attribute, two: Attribute) -> bool:
 
 def _find_copies(instance: Instance, name: str, factor: float = 1.0) -> list[tuple[int, int]]:
     """Return where the observation has the place, or its difference to something, times a factor; and the sign."""
-    plain, shifted = (_observe(instance, name, shift) for shift in (0.0, 1.0))
-    if plain.shape != shifted.shape:
+    before, plain, shifted = (_observe(instance, name, shift) for shift in (0.0, 0.0, 1.0))
+    if before.shape != plain.shape or plain.shape != shifted.shape:
         return []
+    noise = np.minimum(np.abs(plain - before), MOST_NOISE)  # an engine may keep contacts of the episode before
     change, shift = shifted - plain, factor * SHIFT[: read_attributes(instance.env)[name].numbers.size]
     parts = [change[element : element + len(shift)] for element in range(len(change) - len(shift) + 1)]
-    rounding = [ROUNDING + PART * np.abs(plain[i : i + len(shift)]).max() for i in range(len(parts))]
+    allowed = ROUNDING + PART * np.abs(plain) + 2 * noise
+    most = [allowed[i : i + len(shift)].max() for i in range(len(parts))]
     return [
-        (i, sign) for i, part in enumerate(parts) for sign in (1, -1) if np.abs(part - sign * shift).max() < rounding[i]
+        (i, sign) for i, part in enumerate(parts) for sign in (1, -1) if np.abs(part - sign * shift).max() < most[i]
     ]
 
 
-def _observe(instance: Instance, name: str, shift: float) -> Numbers:
+def _find_turned(instance: Instance, name: str) -> list[Source]:
+    """Return where the observation has the way to the place in a frame that is turned against the world's."""
+    size = read_attributes(instance.env)[name].numbers.size
+    plain = _observe(instance, name, 0.0)
+    shifted = [_observe(instance, name, 1.0, TURN_SHIFT * axis) for axis in np.eye(size)]
+    if size < 2 or any(row.shape != plain.shape for row in shifted):
+        return []
+    turns = np.stack([row - plain for row in shifted]) / TURN_SHIFT  # shape (size, elements)
+    found: list[Source] = []
+    for element in range(plain.size - size + 1):
+        turn = turns[:, element : element + size]
+        is_rotation = np.abs(turn @ turn.T - np.eye(size)).max() < TURN_ERROR
+        is_plain = np.abs(np.abs(turn) - np.eye(size)).max() < TURN_ERROR
+        if is_rotation and not is_plain:
+            found.append((element, TURNED))
+    return found
+
+
+def _observe(instance: Instance, name: str, shift: float, along: Numbers = SHIFT) -> Numbers:
     """Return the observation of the first step if the place is shifted before it. Shape (elements,)."""
     episode = EpisodePlayer(instance, FIRST_SEED, "zero", max_steps=1)
     episode.reset()
     attribute = read_attributes(instance.env)[name]
-    moved = attribute.numbers + shift * SHIFT[: attribute.numbers.size]
+    moved = attribute.numbers + shift * along[: attribute.numbers.size]
     attribute.assign(shape_like(attribute.value, moved))
     return flatten_floats(instance.leaves, episode.step().observation)
 
@@ -301,7 +371,7 @@ def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> di
 def measure_distances(trials: GoalTrials, source: Source) -> Numbers:
     """Return how far the goal is from the robot at the start of some episodes. Shape (STARTS_COMPARED,)."""
     episodes = [GoalEpisode(trials, FIRST_SEED + number) for number in range(STARTS_COMPARED)]
-    return np.array([np.linalg.norm(episode.read(source) - episode.goal) for episode in episodes])
+    return np.array([episode.measure_distance(source) for episode in episodes])
 
 
 def find_sources(copies: Sequence[Source], rows: Numbers, goals: Numbers) -> list[Source]:

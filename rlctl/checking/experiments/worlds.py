@@ -51,6 +51,7 @@ class WatchedWorlds:
     instance: Instance
     worlds: Sequence[LoggedWorld]
     calls: BulletCalls
+    mujoco_calls: MujocoCalls
     low: Array  # Of the action. Shape (n,)
     high: Array
 
@@ -110,7 +111,7 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
         yield from _log_episodes(logger, context)
         bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
         low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
-        watched = WatchedWorlds(instance, logger.worlds, calls, low, high)
+        watched = WatchedWorlds(instance, logger.worlds, calls, mujoco_calls, low, high)
         for message in list(judges_worlds.judge(watched)):
             if isinstance(message, RuleFinding):
                 found.append(message.rule)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from rlctl.checking.experiments.goals import (
     GoalTrials,
     Numbers,
     Source,
-    find_sources,
     judges_goals,
 )
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
@@ -24,13 +23,14 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The further away the goal is, the larger is the reward, to both sides; or every failure pays more than
-        success, which goes on. The check played the same steps again, and put the goal, or the command, where
-        is_success is true, and at several distances from there. So the policy learns to keep away from the
-        goal. Most often a sign is wrong, or an error is paid instead of a function that falls with it.
+        success, which goes on; or a goal that goes away pays more than one that comes nearer. The check played
+        the same steps again, and put the goal, or the command, where is_success is true, and at several
+        distances from there. So the policy learns to keep away from the goal. Most often a sign is wrong, or an
+        error is paid instead of a function that falls with it.
     """,
     fix="""
-        Make the reward largest where the task is done: subtract the distance or the error, or pay
-        exp(-error / scale).
+        Make the reward largest where the task is done: subtract the distance or the error, pay
+        exp(-error / scale), or pay progress as previous - distance.
     """,
 )
 
@@ -39,6 +39,8 @@ LATER_STEPS = 2  # with the goal moved: the first may pay the way to it as progr
 EPISODES, MOST_EPISODES = 3, 10  # that are needed, and that are tried
 FEWEST_MOVED = 0.02  # part of the goals' range: how far apart the robot is in these episodes
 RADII = (0.35, 0.7, 1.0)  # parts of the goals' range
+WAY_RADIUS, WAY = 0.7, 0.2
+"""Parts of the goals' range, at which a goal is that comes nearer or goes away in a step, and of this distance."""
 LEAST = 1e-6  # differences of rewards that count, of their size
 
 
@@ -52,6 +54,12 @@ class _Outcome:
     place: Numbers  # of the robot
 
 
+_MeasureAxis = Callable[[GoalTrials, Source, int, int, _Outcome], Sequence[float]]
+"""Returns rewards that show something wrong along an axis in an episode, or nothing."""
+_Describe = Callable[[GoalTrials, Sequence[int], Sequence[float]], RuleFinding]
+"""Describes what is wrong along some axes, by these rewards."""
+
+
 @judges_goals(RULE)
 def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     """Put the goal where the robot is, and to either side."""
@@ -62,46 +70,80 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     if source is None:
         yield Skipped(RULE.id, "no goal next to the robot was a success")
         return
-    axes = list(range(trials.goals.shape[1]))
-    places: list[Numbers] = []
-    shown: Sequence[float] = ()
-    for number in range(MOST_EPISODES):
-        inside = _measure(trials, source, number, np.zeros(trials.goals.shape[1]))
-        if inside is None or not inside.succeeds:
-            continue
-        places.append(inside.place)
-        rising = {axis: _measure_sides(trials, source, number, axis, inside) for axis in axes}
-        axes = [axis for axis in axes if rising[axis]]
-        if not axes:
-            return
-        shown = rising[axes[0]]
-        if len(places) == EPISODES:
-            break
-    else:
+    insides = _find_insides(trials, source)
+    if len(insides) < EPISODES:
         yield Skipped(RULE.id, "no goal next to the robot was a success in several episodes")
         return
-    moved = np.ptp(np.array(places), axis=0) > FEWEST_MOVED * trials.range
-    axes = [axis for axis in axes if moved[axis]]
-    if axes:
-        yield _describe(trials, axes, shown)
+    moved = np.ptp(np.array([inside.place for inside in insides.values()]), axis=0) > FEWEST_MOVED * trials.range
+    looks: list[tuple[_MeasureAxis, _Describe]] = [
+        (_measure_sides, _describe_distance),
+        (_measure_ways, _describe_way),
+    ]
+    for measure, describe in looks:
+        axes, shown = _find_axes(trials, source, insides, measure)
+        axes = [axis for axis in axes if moved[axis]]
+        if axes:
+            yield describe(trials, axes, shown)
+            return
 
 
-def _describe(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float]) -> RuleFinding:
-    name = trials.drawn.name
-    parts = list_names([f"{name}[{axis}]" for axis in axes]) if trials.goals.shape[1] > 1 else name
+def _find_insides(trials: GoalTrials, source: Source) -> dict[int, _Outcome]:
+    """Return what a goal gives that is where the robot is, by episode; of those in which it is a success."""
+    insides: dict[int, _Outcome] = {}
+    for number in range(MOST_EPISODES):
+        inside = _measure(trials, source, number, np.zeros((LATER_STEPS, trials.goals.shape[1])))
+        if inside is not None and inside.succeeds:
+            insides[number] = inside
+        if len(insides) == EPISODES:
+            break
+    return insides
+
+
+def _find_axes(
+    trials: GoalTrials, source: Source, insides: Mapping[int, _Outcome], measure: _MeasureAxis
+) -> tuple[list[int], Sequence[float]]:
+    """Return the axes along which something wrong is measured in all episodes, and rewards that show it."""
+    axes = list(range(trials.goals.shape[1]))
+    shown: Sequence[float] = ()
+    for number, inside in insides.items():
+        wrong = {axis: measure(trials, source, number, axis, inside) for axis in axes}
+        axes = [axis for axis in axes if wrong[axis]]
+        if not axes:
+            return [], ()
+        shown = wrong[axes[0]]
+    return axes, shown
+
+
+def _describe_distance(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float]) -> RuleFinding:
     near, *_, far = shown
     lengths = " and ".join(f"{radius * trials.range[axes[0]]:.3g}" for radius in (RADII[0], RADII[-1]))
-    message = f"the reward rises with the distance to the goal ({parts}): {near:.4g} and {far:.4g} at {lengths}"
-    evidence = {"element": name, "value": far, "expected": f"below {near:.6g}"}
+    rises = f"the reward rises with the distance to the goal ({_name_axes(trials, axes)})"
+    if far <= near:
+        rises = f"the reward is larger at any distance to the goal ({_name_axes(trials, axes)}) than at the goal"
+    message = f"{rises}: {near:.4g} and {far:.4g} at {lengths}"
+    evidence = {"element": trials.drawn.name, "value": far, "expected": f"below {near:.6g}"}
     return RuleFinding(RULE, message, evidence)
+
+
+def _describe_way(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float]) -> RuleFinding:
+    near, far = shown
+    way = f"{WAY * WAY_RADIUS * trials.range[axes[0]]:.3g}"
+    comes = f"the reward is {near:.4g} where the goal ({_name_axes(trials, axes)}) comes {way} nearer in a step"
+    message = f"{comes}, and {far:.4g} where it goes as far away"
+    evidence = {"element": trials.drawn.name, "value": far, "expected": f"below {near:.6g}"}
+    return RuleFinding(RULE, message, evidence)
+
+
+def _name_axes(trials: GoalTrials, axes: Sequence[int]) -> str:
+    name = trials.drawn.name
+    return list_names([f"{name}[{axis}]" for axis in axes]) if trials.goals.shape[1] > 1 else name
 
 
 def _find_source(trials: GoalTrials) -> tuple[Source | None, bool]:
     """Return the part of the observation with the place that a goal has to have for a success; and whether success is
     reported at all."""
     episode, reports_success = _begin(trials, 0), False
-    sources = find_sources(trials.drawn.copies, episode.observed[None], episode.goal[None])
-    for source in sources[:MOST_SOURCES]:
+    for source in trials.list_sources(episode)[:MOST_SOURCES]:
         if episode.has_ended:
             episode = _begin(trials, 0)
         for step in episode.play([episode.read(source)]):
@@ -115,16 +157,16 @@ def _begin(trials: GoalTrials, number: int) -> GoalEpisode:
     return GoalEpisode(trials, FIRST_SEED + number, "repeated", FIRST_STEPS)
 
 
-def _measure(trials: GoalTrials, source: Source, number: int, offset: Numbers) -> _Outcome | None:
-    """Return what a goal gives that stays as far from the robot, which moves as in the last step; None if the episode
-    ended before, or had a success already."""
+def _measure(trials: GoalTrials, source: Source, number: int, offsets: Numbers) -> _Outcome | None:
+    """Return what a goal gives that is so far from the robot in the later steps, which moves as in the last one; None
+    if the episode ended before, or had a success already. Shape of the offsets: (LATER_STEPS, size)."""
     episode = GoalEpisode(trials, FIRST_SEED + number, "repeated", FIRST_STEPS - 1)
     before = episode.read(source)
     episode.play([None])
     outcome = None
     if episode.has_succeeded:
         return None
-    for _ in range(LATER_STEPS):
+    for offset in offsets:
         if episode.has_ended:
             break
         place = episode.read(source)
@@ -141,9 +183,9 @@ def _measure_sides(trials: GoalTrials, source: Source, number: int, axis: int, i
     for sign in (1.0, -1.0):
         outside = []
         for radius in RADII:
-            offset = np.zeros(trials.goals.shape[1])
-            offset[axis] = sign * radius * trials.range[axis]
-            outcome = _measure(trials, source, number, offset)
+            offsets = np.zeros((LATER_STEPS, trials.goals.shape[1]))
+            offsets[:, axis] = sign * radius * trials.range[axis]
+            outcome = _measure(trials, source, number, offsets)
             if outcome is None or outcome.succeeds or outcome.has_ended:
                 return ()
             outside.append(outcome.reward)
@@ -153,13 +195,32 @@ def _measure_sides(trials: GoalTrials, source: Source, number: int, axis: int, i
     return shown
 
 
+def _measure_ways(trials: GoalTrials, source: Source, number: int, axis: int, _: _Outcome) -> Sequence[float]:
+    """Return the rewards with a goal to one side of the robot that comes nearer in the last step, and with one that
+    goes as far away, if the second is larger, and so it is to the other side. Otherwise nothing."""
+    shown: list[float] = []
+    for sign in (1.0, -1.0):
+        rewards = []
+        for change in (-WAY, WAY):
+            offsets = np.zeros((LATER_STEPS, trials.goals.shape[1]))
+            offsets[:, axis] = sign * WAY_RADIUS * trials.range[axis]
+            offsets[-1] *= 1 + change
+            outcome = _measure(trials, source, number, offsets)
+            if outcome is None or outcome.succeeds or outcome.has_ended:
+                return ()
+            rewards.append(outcome.reward)
+        if not _rises(rewards):
+            return ()
+        shown = rewards
+    return shown
+
+
 def _rises(rewards: Sequence[float]) -> bool:
     least = LEAST * max(1.0, *map(abs, rewards))
     return all(far > near + least for near, far in itertools.pairwise(rewards))
 
 
 def _exceeds(rewards: Sequence[float], inside: _Outcome) -> bool:
-    """Say whether failures never pay less with the distance, and more than a success that does not end the episode."""
+    """Say whether failures pay more than a success that does not end the episode."""
     least = LEAST * max(1.0, *map(abs, rewards))
-    falls = any(far < near - least for near, far in itertools.pairwise(rewards))
-    return not inside.has_ended and not falls and rewards[0] > inside.reward + least
+    return not inside.has_ended and min(rewards) > inside.reward + least

@@ -4,7 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import GoalEpisode, GoalTrials, Source, judges_goals, measure_distances
+from rlctl.checking.experiments.goals import (
+    TURNED,
+    GoalEpisode,
+    GoalTrials,
+    Numbers,
+    Source,
+    judges_goals,
+    measure_distances,
+)
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -21,7 +29,8 @@ RULE = Rule(
 )
 
 EPISODES = 8
-LONGEST = 400  # steps; longer episodes are not judged
+LENGTHS = 25, 100, 400  # steps that are played, until it moved far enough; longer episodes are not judged
+FAR = 4.0  # times the range of the goals
 SLOW = 0.25  # part of the usual distance
 MOVED = 1e-6  # part of the usual distance: what the action changes at least
 
@@ -37,8 +46,10 @@ def _compare_ways(trials: GoalTrials) -> Iterator[ChildMessage]:
     farthest, steps = 0.0, 0
     for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
         held = _measure_way(trials, source, seed, "repeated", SLOW * usual)
+        if held is None:
+            return
         nothing = _measure_way(trials, source, seed, "zero", SLOW * usual)
-        if held is None or nothing is None:
+        if nothing is None:
             return
         if abs(held[0] - nothing[0]) < MOVED * usual:
             return  # the action does not move it, as an object that is not touched
@@ -52,15 +63,52 @@ def _compare_ways(trials: GoalTrials) -> Iterator[ChildMessage]:
 def _measure_way(
     trials: GoalTrials, source: Source, seed: int, actions: str, enough: float
 ) -> tuple[float, int] | None:
-    """Return how far an episode leads from its start at most, and its steps; None if that is enough, if it succeeds,
-    or has no end."""
-    episode = GoalEpisode(trials, seed, actions)
-    start, farthest = episode.read(source), 0.0
-    for step in range(1, LONGEST + 1):
-        episode.step()
-        farthest = max(farthest, float(np.linalg.norm(episode.read(source) - start)))
-        if not farthest < enough or episode.has_succeeded:
+    """Return how far an episode leads from its first step at most, and its steps; None if that is enough, if it
+    succeeds, or has no end."""
+    for most_steps in LENGTHS:
+        places, has_ended = _trace(trials, source, seed, actions, most_steps)
+        if len(places) == 0:
             return None
-        if episode.has_ended:
-            return farthest, step
+        farthest = float(np.linalg.norm(places - places[0], axis=1).max())
+        if not farthest < enough:
+            return None
+        if has_ended:
+            return farthest, len(places)
     return None
+
+
+def _trace(trials: GoalTrials, source: Source, seed: int, actions: str, most_steps: int) -> tuple[Numbers, bool]:
+    """Return where the robot is after each step of an episode, shape (steps, size), and whether the episode ended; no
+    place if it succeeds."""
+    if source[1] == TURNED:
+        return _trace_turned(trials, source, seed, actions, most_steps)
+    episode = GoalEpisode(trials, seed, actions)
+    places: list[Numbers] = []
+    while not episode.has_ended and len(places) < most_steps:
+        episode.step()
+        places.append(episode.read(source))
+    if episode.has_succeeded:
+        places = []
+    return np.array(places), episode.has_ended
+
+
+def _trace_turned(trials: GoalTrials, source: Source, seed: int, actions: str, most_steps: int) -> tuple[Numbers, bool]:
+    """Play the episode with the goal at several places, far away, and find the robot by its distances to them: from
+    |a - p|^2 - |b - p|^2 = |a|^2 - |b|^2 - 2 p (a - b)."""
+    size = trials.goals.shape[1]
+    anchors = trials.goals.mean(axis=0) + FAR * trials.range.max() * np.vstack([np.eye(size), -np.ones(size)])
+    squares = []
+    for anchor in anchors:
+        episode = GoalEpisode(trials, seed, actions)
+        distances: list[float] = []
+        while not episode.has_ended and len(distances) < most_steps:
+            episode.step(anchor)
+            distances.append(episode.measure_distance(source))
+        if episode.has_succeeded:
+            return np.zeros((0, size)), True
+        squares.append(np.square(distances))
+    steps = min(map(len, squares))
+    differences = np.stack([square[:steps] - squares[-1][:steps] for square in squares[:-1]], axis=1)
+    constants = np.square(anchors[:-1]).sum(axis=1) - np.square(anchors[-1]).sum()
+    places = np.linalg.solve(2 * (anchors[:-1] - anchors[-1]), (constants - differences).T).T
+    return places, episode.has_ended

@@ -10,7 +10,7 @@ from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judge
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
-from rlctl.checking.mujoco_worlds import MujocoStateReader
+from rlctl.checking.mujoco_worlds import FREE, MujocoStateReader
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
@@ -89,8 +89,9 @@ def _untouched(kind: str, swapped: dict[str, tuple[str, float]], elements: str, 
 
 
 def _find_flags(plain: Array, changed: Array) -> list[int]:
-    """Return columns that are 0 and become 0 or 1, and the reward if it differs by few values. A column that becomes
-    what another one is already is left out: the environment observes the neighbour, too."""
+    """Return columns that are 0 and become 0 or 1, and the reward if it becomes larger by few values: what costs is
+    meant not to touch. A column that becomes what another one is already is left out: the environment observes the
+    neighbour, too."""
     flags = [
         column
         for column in range(plain.shape[1] - 1)
@@ -100,7 +101,7 @@ def _find_flags(plain: Array, changed: Array) -> list[int]:
     ]
     differences = np.unique(np.round(changed[:, -1] - plain[:, -1], 6))
     others = [c for c in range(plain.shape[1] - 1) if c not in flags and not np.array_equal(plain[:, c], changed[:, c])]
-    is_counted = not others and 1 < len(differences) <= MOST_COUNTS and 0.0 in differences
+    is_counted = not others and 1 < len(differences) <= MOST_COUNTS and differences.min() == 0.0
     return [*flags, *([plain.shape[1] - 1] if is_counted else [])]
 
 
@@ -115,7 +116,10 @@ def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader, kind: str) -
     for name in [name for asked, name in calls.asked if asked == kind]:
         if not (part := _find_part(model, kind, name)):
             continue
-        near = _find_near(model, int(bodies[part]) if kind == "geom" else part)
+        body = int(bodies[part]) if kind == "geom" else part
+        if _is_trunk(model, body):
+            continue  # that it touches is a fall, whatever its legs do
+        near = _find_near(model, body)
         if kind == "geom":
             rate_of = {geom: float(rates[geom]) for geom in np.flatnonzero(np.isin(bodies, near)).tolist()}
         else:
@@ -126,6 +130,13 @@ def _find_neighbours(calls: MujocoCalls, reader: MujocoStateReader, kind: str) -
         if own <= NEVER and best and names[best] >= OFTEN:
             swapped[name] = best, names[best]
     return swapped
+
+
+def _is_trunk(model: Any, body: int) -> bool:
+    """Say whether a body is the free base of others."""
+    joint = int(model.body_jntadr[body])
+    is_free = joint >= 0 and int(model.jnt_type[joint]) == FREE
+    return is_free and bool((model.body_parentid == body).any())
 
 
 def _find_near(model: Any, body: int) -> list[int]:

@@ -1,0 +1,109 @@
+"""RL125: goal turned the wrong way."""
+
+import collections
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rlctl.checking import attitudes
+from rlctl.checking.bullet_worlds import read_poses, read_world
+from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, judges_goals
+from rlctl.checking.mujoco_worlds import MujocoStateReader
+from rlctl.checking.records import FIRST_SEED, ChildMessage
+from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.worlds import ORIENTATION, Array, Poses, World
+from rlctl.environments.bullet_clients import find_clients
+from rlctl.environments.info import find_mujoco
+
+RULE = Rule(
+    "RL125",
+    "goal turned the wrong way",
+    Severity.WARNING,
+    meaning="""
+        The observation has the way to a goal, turned by the orientation of a free body, or by its yaw, in the wrong
+        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how
+        it is turned. A policy that does not see the heading too cannot learn where the goal is.
+    """,
+    fix="""
+        From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v); by a yaw
+        x' = cos(yaw) x + sin(yaw) y and y' = cos(yaw) y - sin(yaw) x.
+    """,
+)
+
+EPISODES, MOST_EPISODES = 4, 8  # that have to show it, and that are played
+SAME, LEAST_TURN = 0.01, 0.2  # of the elements of rotation matrices; of a rotation and its inverse
+
+
+class _Frame(NamedTuple):
+    """A free body."""
+
+    name: str
+    client: int
+    body: int
+
+
+@judges_goals(RULE)
+def _find_turned_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
+    """Compare how the observation turns the way to the goal with how the engine has turned what moves."""
+    for element, _ in trials.drawn.turned:
+        frame = _find_wrong_frame(trials, element)
+        if frame:
+            size = trials.goals.shape[1]
+            name = f"observation[{element}:{element + size}]"
+            message = f"{name} is the way to {trials.drawn.name}, turned by the orientation of {frame} the wrong way"
+            evidence = {"element": name, "seed": FIRST_SEED, "value": frame}
+            yield RuleFinding(RULE, f"{message}: in no frame of the robot", evidence)
+            return
+
+
+def _find_wrong_frame(trials: GoalTrials, element: int) -> str:
+    """Return what has turned the way to the goal the wrong way in several episodes, in which it was turned enough to
+    tell; empty if it is in the frame of anything, or there are too few."""
+    counts: collections.Counter[_Frame] = collections.Counter()
+    others: set[_Frame] = set()
+    for seed in range(FIRST_SEED, FIRST_SEED + MOST_EPISODES):
+        episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
+        if episode.has_ended:
+            continue
+        turn = episode.read_turn(element)
+        for frame, quaternion in _read_orientations(trials.instance.env).items():
+            matrices = [m for m in _list_turns(quaternion, len(turn)) if np.abs(m - m.T).max() >= LEAST_TURN]
+            if any(_is_same_turn(turn, matrix.T) for matrix in matrices):
+                return ""
+            if any(_is_same_turn(turn, matrix) for matrix in matrices):
+                counts[frame] += 1
+            elif matrices:
+                others.add(frame)
+    return next((frame.name for frame, count in counts.items() if count >= EPISODES and frame not in others), "")
+
+
+def _is_same_turn(turn: Array, matrix: Array) -> bool:
+    return min(float(np.abs(turn - sign * matrix).max()) for sign in (1.0, -1.0)) < SAME
+
+
+def _list_turns(quaternion: Array, size: int) -> list[Array]:
+    """Return the rotation about the vertical, and in space the whole one. Shape (size, size) each."""
+    (matrix,) = attitudes.compute_matrices(quaternion[None])
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    level = np.eye(3)
+    level[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    return [level, matrix] if size == 3 else [level[:size, :size]]
+
+
+def _read_orientations(env: Any) -> dict[_Frame, Array]:
+    """Return the quaternions, x, y, z, w, of free bodies."""
+    worlds: list[tuple[World, Poses]] = []
+    if (simulation := find_mujoco(env)) is not None:
+        reader = MujocoStateReader(*simulation)
+        reader.update()
+        worlds.append((reader.world, reader.read_poses()))
+    for client in find_clients():  # others may be connected that other instances have
+        world = read_world(client)
+        worlds.append((world, read_poses(world)))
+    return {
+        _Frame(body.name, world.client, body.id): poses[body.id, -1][ORIENTATION]
+        for world, poses in worlds
+        for body in world.bodies
+        if body.is_free
+    }
