@@ -108,14 +108,14 @@ def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> 
     return Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
 
 
-def measure_reach(chain: Chain, link: int, size: int) -> Reach:
-    """Return how far from the base a link gets, in the first `size` axes: at random, and then joint by joint."""
+def measure_reach(chain: Chain, link: int, axes: Sequence[int]) -> Reach:
+    """Return how far from the base a link gets, along some axes of the world: at random, and then joint by joint."""
     low, high = np.array(chain.ranges).T
     rng = np.random.default_rng(FIRST_SEED)
 
     def distance(values: Numbers) -> float:
         chain.set_joints(values)
-        return float(np.linalg.norm((chain.read()[link] - chain.base)[:size]))
+        return float(np.linalg.norm((chain.read()[link] - chain.base)[list(axes)]))
 
     best = max(rng.uniform(low, high, (SAMPLES, len(low))), key=distance)
     for _ in range(SWEEPS):
@@ -127,7 +127,7 @@ def measure_reach(chain: Chain, link: int, size: int) -> Reach:
     how = (
         f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} m away from there at most"
     )
-    return Reach(chain.base[:size].tolist(), reach, how, " m")
+    return Reach(chain.base[list(axes)].tolist(), reach, how, " m")
 
 
 def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
