@@ -36,10 +36,11 @@ PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
 ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
 FIELDS = ("data.", "model.")
 KEPT = (
-    *("data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied", "data.mocap_pos"),
+    *("data.qpos", "data.qvel", "data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied"),
+    *("data.mocap_pos", "data.mocap_quat", "data.userdata"),
     *("data.qacc_warmstart", "model.body_mass", "model.geom_friction", "model.dof_damping", "model.actuator_gainprm"),
 )
-"""What mj_resetData sets back besides positions and velocities, and what is randomised most often."""
+"""What mj_resetData sets back, and what is randomised most often."""
 UNSTABLE = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 

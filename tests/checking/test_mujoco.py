@@ -125,6 +125,25 @@ def test_finding_names_what_is_wrong(name, rule, words):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("ArmKeepsSpeed", "data.qvel[0]"),
+        ("HopperKeepsPlace", "data.qpos[0]"),
+        ("ArmKeepsActivation", "data.act[0]"),
+        ("ArmKeepsMocap", "data.mocap_pos[0, "),
+    ],
+)
+def test_kept_state_that_is_observed_is_named_first(name, kept):
+    (finding,) = findings(f"broken_mujoco.py:{name}", "RL301")
+    field = kept.partition("[")[0]
+    assert f"reset keeps state ({field}" in finding.message
+    assert f"; {finding.evidence['element']} is {kept}" in finding.message
+    assert finding.fix.startswith(f"Set back in reset: {field}")
+    assert finding.fix.endswith("mujoco.mj_resetData(model, data) sets back all of data.")
+
+
+@pytest.mark.slow
 def test_rules_that_compare_repeated_episodes_say_why_they_could_not():
     """RL815 would be a pass that nobody judged."""
     verdict = judge(records_of("broken_mujoco.py:ArmOldTipAtRandom", "build", "worlds"), ["RL815"])
