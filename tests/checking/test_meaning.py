@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rlctl.checking.rates import find_rates
-from rlctl.checking.rule import NotJudged
+from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
@@ -104,6 +104,12 @@ def test_the_reach_is_measured_along_the_axes_that_are_drawn():
     assert reach.centre == pytest.approx([0.0, 0.1])  # along x and z
 
 
+def test_goals_that_are_reached_at_once_are_none_to_come_nearer_to():
+    verdict = verdict_of(f"{REACH}:PlanarArmIsThere", "RL623")
+    # More time would change nothing, so that it is not counted among the rules that lack time.
+    assert verdict.not_applicable == {"RL623": "episodes are too short, or begin with a success"}
+
+
 def test_what_the_joints_do_not_move_is_not_the_hand():
     goals = shared_records_of(f"{REACH}:ArmUnclearReward", "goals").require_fact("goals")
     (reach,) = goals.reaches.values()  # where the goal itself is observed, its difference to itself is the base
@@ -190,5 +196,5 @@ def test_edge_of_a_workspace_is_found_and_a_path_has_none():
     assert reach.centre == pytest.approx([1.0, -1.0], abs=0.05)
     assert reach.distance == pytest.approx(2.0, abs=0.05)
     walk = np.cumsum(rng.normal(size=(20, 100, 2)), axis=1).reshape(-1, 2)
-    with pytest.raises(NotJudged):
+    with pytest.raises(NotApplicable):
         find_reach(walk, episodes)
