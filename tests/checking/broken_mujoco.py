@@ -286,6 +286,17 @@ class RL816ArmBeyondRange(MujocoArm):
     home, gain = np.zeros(3), 4.0
 
 
+class ArmWithJet(MujocoArm):
+    """Another actuator, the first one, pushes a site."""
+
+    xml = ARM.replace("<actuator>", '<actuator><general name="jet" site="tip" gear="0 0 1 0 0 0" ctrlrange="0 1"/>')
+
+
+class RL816ArmWithJetBeyondRange(ArmWithJet):
+    rlctl_ignore = {"RL805": "a consequence"}
+    home, gain = np.zeros(3), 4.0
+
+
 class RL816HopperTorqueBeyondRange(MujocoHopper):
     def move(self, action):
         self.data.ctrl[:] = 30.0 * action
