@@ -113,7 +113,7 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
         ("RL815ArmResetsWithoutForward", "RL815", ("of reset", "before mj_forward")),
         ("RL815HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),
         ("RL816ArmBeyondRange", "RL816", ("only", "of the action's range")),
-        ("RL816ArmWithJetBeyondRange", "RL816", ("ctrl[2] (lift)", "turn, bend")),
+        ("RL816ArmWithJetBeyondRange", "RL816", ("ctrl[3] (bend)", "turn, lift")),
         ("RL817ArmGrowsHeavy", "RL817", ("body_mass[1] (upper)",)),
         ("RL817HopperSlips", "RL817", ("geom_friction[", ", 0]")),
         ("RL302ArmKeepsActivation", "RL302", ("reset keeps state (data.act",)),
