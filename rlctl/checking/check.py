@@ -162,7 +162,7 @@ class CheckReport:
         if late := len(self.out_of_time):
             open_rules = f"{late} of {output.format_count(judged + late, 'rule')} not judged for lack of time"
             return (
-                f"{self.task}: not finished: {open_rules} (--budget {self.needed_budget}); "
+                f"{self.task}: not finished: {open_rules} (needs --budget {self.needed_budget}); "
                 f"{found} from the other {judged} "
                 f"in {self.seconds:.1f} s"
             )

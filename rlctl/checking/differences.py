@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.mujoco_worlds import FIELDS
+from rlctl.checking.kept_state import MUJOCO, KeptState, describe_kept
 from rlctl.checking.records import CheckedEpisode, Records, Series
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity, list_names
 from rlctl.environments.success import SUCCESS
@@ -25,6 +25,7 @@ class FirstDifference:
     element: str  # what differs most there: an element, the reward, a flag, or the length
     first: float
     second: float
+    place: tuple[int, int] | None  # of an element: of its array, and its flat index in it
     size: float  # The largest difference at that step, relative to the larger value or to 1
     largest: float  # The same over all steps that were compared
     seed: int
@@ -75,25 +76,24 @@ def report(
     return RuleFinding(rule, f"{what}: {found.text()}{cause}", found.evidence(), severity, fix)
 
 
-def _find_cause(records: Records) -> tuple[str, str]:
+def _find_cause(records: Records, difference: FirstDifference) -> tuple[str, str]:
     fresh = records.role("fresh process")
-    names: list[str] = records.facts.get("kept", [])
     if not fresh or find_difference(records, records.require_role("alone"), fresh[0]) is not None:
         return "", ""  # a new process differs too: chance
     if find_difference(records, records.require_role("reused"), records.require_role("dirty")) is None:
         fix = "Let every reset do what the first one does: restore a saved state before anything reads it."
         return "; the first episode of an instance differs from all later ones", fix
-    kept = list_names(names, most=5)
-    what = kept or "every attribute that step changes, and the whole simulation"
-    shown = f" ({kept})" if kept else ""
-    return f"; a new process repeats it, so reset keeps state{shown}", f"Set back in reset: {what}."
+    kept: list[KeptState] = records.facts.get("kept", [])
+    place = difference.place if difference.step == 0 else None
+    names, fix = describe_kept(kept, place, difference.element)
+    return f"; a new process repeats it, so reset keeps state{names}", fix
 
 
 def compare_itself(rule: Rule, records: Records, what: str, *, at_reset: bool) -> Iterator[RuleFinding]:
     """Yield that an episode differs from its repetition, at reset or later; `what` was done."""
     difference = compare(records, "alone", "reused")
     if difference is not None and (difference.step == 0) is at_reset:
-        yield report(rule, records, difference, what, *_find_cause(records))
+        yield report(rule, records, difference, what, *_find_cause(records, difference))
 
 
 def compare_other(rule: Rule, records: Records, first: str, second: str, what: str) -> Iterator[RuleFinding]:
@@ -101,9 +101,14 @@ def compare_other(rule: Rule, records: Records, first: str, second: str, what: s
     if (difference := compare(records, first, second)) is not None:
         if compare(records, "alone", "reused") is not None:
             raise NotJudged("the same instance already differs from itself (RL301, RL302)")
-        fields = [name for name in records.facts.get("kept", []) if name.startswith(FIELDS) and second == "dirty"]
-        cause = f"; reset keeps {list_names(fields)} of MuJoCo" if fields else ""
+        cause = _name_fields(records) if second == "dirty" else ""
         yield report(rule, records, difference, what, cause, mild=second == "dirty" and difference.step > LATE)
+
+
+def _name_fields(records: Records) -> str:
+    """Say which fields of MuJoCo a reset keeps; of PyBullet, what differs after a reset may be its contacts' doing."""
+    kept = [one.name for one in records.facts.get("kept", []) if one.engine == MUJOCO]
+    return f"; reset keeps {list_names(kept)} of MuJoCo" if kept else ""
 
 
 def find_difference(records: Records, one: CheckedEpisode, two: CheckedEpisode) -> FirstDifference | None:
@@ -113,7 +118,7 @@ def find_difference(records: Records, one: CheckedEpisode, two: CheckedEpisode) 
     differences = [difference for pair in pairs if (difference := _compare(records, *pair, one.seed))]
     if one.has_ended and two.has_ended and one.steps != two.steps:
         end = min(one.steps, two.steps)
-        differences.append(FirstDifference(end, "length", one.steps, two.steps, 1.0, 1.0, one.seed))
+        differences.append(FirstDifference(end, "length", one.steps, two.steps, None, 1.0, 1.0, one.seed))
     if not differences:
         return None
     earliest = min(differences, key=lambda difference: (difference.step, -difference.size))
@@ -140,5 +145,13 @@ def _compare(records: Records, key: int | str, one: Series, two: Series, seed: i
     relative = np.nan_to_num(relative, nan=np.inf, posinf=np.inf)
     flat = int(np.where(unequal[row], relative[row], -1.0).argmax())
     name = key if isinstance(key, str) else records.require_built().element(key, flat)
-    values = float(a[row, flat]), float(b[row, flat]), float(relative[row, flat]), float(relative.max())
-    return FirstDifference(int(one.steps[row]), name, *values, seed)
+    return FirstDifference(
+        step=int(one.steps[row]),
+        element=name,
+        first=float(a[row, flat]),
+        second=float(b[row, flat]),
+        place=None if isinstance(key, str) else (key, flat),
+        size=float(relative[row, flat]),
+        largest=float(relative.max()),
+        seed=seed,
+    )

@@ -15,6 +15,7 @@ from rich.text import Text
 from rlctl import output
 from rlctl.checking.check import CheckReport
 from rlctl.checking.junit import to_junit
+from rlctl.checking.records import Records
 from rlctl.checking.rule import RuleFinding, Severity
 from rlctl.checking.rules import FAMILIES, RULES, find_rule
 from rlctl.checking.speed import format_speed
@@ -31,6 +32,8 @@ STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO:
 SHOWN_LINES = 3  # of what a dying process printed
 SHOWN_ITEMS = 4  # How much of a list in the evidence is shown; JSON has it whole
 _WITH_EVENTS = "; those of the recipe act with --set randomize=true"
+ABOUT_GOALS = "RL622"  # whose reason applies to the others about goals, too
+GOAL_WORDS = ("goal", "target", "desired", "distance")
 SHOWN_ROWS = 16  # How many parts of the observation are shown
 
 
@@ -166,6 +169,7 @@ def _facts(report: CheckReport) -> Iterator[str]:
         return
     if verdict.not_applicable:
         yield f"does not apply: {_list_rules(list(verdict.not_applicable))} (reasons: --json FILE)"
+        yield from _explain_goals(report)
     for reason in dict.fromkeys(verdict.not_judged.values()):
         names = [name for name, why in verdict.not_judged.items() if why == reason]
         yield f"not judged: {_list_rules(names)}: {reason}"
@@ -173,6 +177,21 @@ def _facts(report: CheckReport) -> Iterator[str]:
         yield f"slow environment: judged on {', '.join(shortened.values())}"
     if advice := report.advice:
         yield advice
+
+
+def _explain_goals(report: CheckReport) -> Iterator[str]:
+    """Say why the rules about goals do not apply to an environment whose names tell that it has a goal."""
+    reason = report.verdict.not_applicable.get(ABOUT_GOALS)
+    if reason is not None and any(word in name.lower() for word in GOAL_WORDS for name in _list_names(report.records)):
+        names = [name for name, why in report.verdict.not_applicable.items() if why == reason]
+        yield f"does not apply: {_list_rules(names)}: {reason}"
+
+
+def _list_names(records: Records) -> set[str]:
+    """Return the names of what is observed and of the numbers in info."""
+    built = records.require_built()
+    keys = {str(key) for leaf in built.leaves for key in leaf.path}
+    return {*keys, *built.names, *(name for episode in records.trajectories for name in episode.infos)}
 
 
 def _randomizes(task: str) -> bool:

@@ -16,7 +16,6 @@ class CommandSpan:
     """The commands that all actions of the space give a motor: from `low` to `high`, by one element of the action."""
 
     motor: JointActuator
-    number: int
     element: int
     low: float
     high: float
@@ -60,5 +59,5 @@ class MotorCommands:
             bounds = np.array([self.low[element], self.high[element]])
             if rest[number] <= SAME * size and is_alone and np.isfinite(bounds).all():
                 ends = (fitted[-1, number] + fitted[element, number] * bounds).tolist()
-                spans.append(CommandSpan(motor, number, element, min(ends), max(ends)))
+                spans.append(CommandSpan(motor, element, min(ends), max(ends)))
         return spans

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
-from rlctl.checking.mujoco_worlds import library
+from rlctl.checking.mujoco_worlds import library, read_commands
 from rlctl.checking.rule import list_names
 from rlctl.checking.worlds import Array, Joint, JointActuator
 from rlctl.environments.info import find_mujoco
@@ -52,7 +52,7 @@ class MotorTrial:
         done = 0
 
         def note(_: Any, data: Any, nstep: int) -> None:
-            played.controls.append(data.ctrl.copy())
+            played.controls.append(read_commands(data, self.motors))
 
         def change(model: Any, data: Any) -> None:
             if move is not None and done == after:
@@ -97,5 +97,7 @@ class MotorTrial:
 
     def name_others(self, exchanged: Mapping[int, int]) -> str:
         """Return the motors after the first one, and what they answer."""
-        pairs = [f"ctrl[{motor}] that of {self.joints[joint].name}" for motor, joint in exchanged.items()]
+        pairs = [
+            f"ctrl[{self.motors[motor].number}] that of {self.joints[joint].name}" for motor, joint in exchanged.items()
+        ]
         return f"; {list_names(pairs[1:])}"

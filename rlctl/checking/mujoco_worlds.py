@@ -6,6 +6,7 @@ brought up to date at each `update`, and read.
 
 import math
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -36,10 +37,11 @@ PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
 ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
 FIELDS = ("data.", "model.")
 KEPT = (
-    *("data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied", "data.mocap_pos"),
+    *("data.qpos", "data.qvel", "data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied"),
+    *("data.mocap_pos", "data.mocap_quat", "data.userdata"),
     *("data.qacc_warmstart", "model.body_mass", "model.geom_friction", "model.dof_damping", "model.actuator_gainprm"),
 )
-"""What mj_resetData sets back besides positions and velocities, and what is randomised most often."""
+"""What mj_resetData sets back, and what is randomised most often."""
 UNSTABLE = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
@@ -86,8 +88,8 @@ def read_world(model: Any) -> World:
     bodies = sorted((_body(model, root) for root in roots), key=lambda body: (not body.joints, not body.is_free))
     world = WorldBody(0, "the world", ("",), (), is_free=False, has_heavy_links=False)
     motors = [_motor(model, actuator) for actuator in range(model.nu)]
-    known = tuple(motor for motor in motors if motor is not None)
-    return World(0, (*bodies[:MOST_BODIES], world), "MuJoCo", known if len(known) == len(motors) else ())
+    known = tuple(motor for motor in motors if motor is not None)  # others drive tendons and sites
+    return World(0, (*bodies[:MOST_BODIES], world), "MuJoCo", known)
 
 
 def _links(model: Any, root: int) -> list[int]:
@@ -121,7 +123,12 @@ def _motor(model: Any, actuator: int) -> JointActuator | None:
     low, high = model.actuator_ctrlrange[actuator] if has_range else (-math.inf, math.inf)
     name = model.actuator(actuator).name or f"actuator {actuator}"
     root, gear = int(model.body_rootid[model.jnt_bodyid[joint]]), float(model.actuator_gear[actuator, 0]) or 1.0
-    return JointActuator(name, _joint(model, joint), root, holds, gear, float(low), float(high))
+    return JointActuator(actuator, name, _joint(model, joint), root, holds, gear, float(low), float(high))
+
+
+def read_commands(data: Any, motors: Sequence[JointActuator]) -> Array:
+    """Return a copy of what was last written for some motors. Shape (motors,)."""
+    return np.array(data.ctrl[[motor.number for motor in motors]])
 
 
 class MujocoStateReader:
@@ -232,18 +239,20 @@ class MujocoStateReader:
     def read_targets(self) -> dict[JointKey, MotorTarget]:
         """See `StateReader`; of actuators whose input is a position."""
         targets = {}
-        for number, motor in enumerate(self.world.motors):
+        for motor in self.world.motors:
             if motor.holds_position:
                 force = math.inf
-                if self.model.actuator_forcelimited[number]:
-                    force = float(np.abs(self.model.actuator_forcerange[number]).max()) * abs(motor.gear)
-                value = float(self.data.ctrl[number]) / motor.gear
+                if self.model.actuator_forcelimited[motor.number]:
+                    force = float(np.abs(self.model.actuator_forcerange[motor.number]).max()) * abs(motor.gear)
+                value = float(self.data.ctrl[motor.number]) / motor.gear
                 targets[motor.body, motor.joint.index] = MotorTarget(value, force, f"actuator {motor.name}")
         return targets
 
     def read_command(self) -> Array | None:
         """See `StateReader`."""
-        return self.data.ctrl.copy() if self._before is not None and self.world.motors else None
+        if self._before is None or not self.world.motors:
+            return None
+        return read_commands(self.data, self.world.motors)
 
     def read_weights(self) -> dict[JointKey, float]:
         """See `StateReader`; empty for robots that stand on something, or are bound by an equality."""

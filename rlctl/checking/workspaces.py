@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rule import NotJudged
+from rlctl.checking.rule import NotApplicable
 from rlctl.checking.worlds import WorldBody
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
 from rlctl.task.env import TaskEnv
@@ -108,14 +108,14 @@ def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> 
     return Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
 
 
-def measure_reach(chain: Chain, link: int, size: int) -> Reach:
-    """Return how far from the base a link gets, in the first `size` axes: at random, and then joint by joint."""
+def measure_reach(chain: Chain, link: int, axes: Sequence[int]) -> Reach:
+    """Return how far from the base a link gets, along some axes of the world: at random, and then joint by joint."""
     low, high = np.array(chain.ranges).T
     rng = np.random.default_rng(FIRST_SEED)
 
     def distance(values: Numbers) -> float:
         chain.set_joints(values)
-        return float(np.linalg.norm((chain.read()[link] - chain.base)[:size]))
+        return float(np.linalg.norm((chain.read()[link] - chain.base)[list(axes)]))
 
     best = max(rng.uniform(low, high, (SAMPLES, len(low))), key=distance)
     for _ in range(SWEEPS):
@@ -127,12 +127,12 @@ def measure_reach(chain: Chain, link: int, size: int) -> Reach:
     how = (
         f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} m away from there at most"
     )
-    return Reach(chain.base[:size].tolist(), reach, how, " m")
+    return Reach(chain.base[list(axes)].tolist(), reach, how, " m")
 
 
 def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
     """Return a centre and how far from it the robot came, if it came as far in many directions: workspaces have such an
-    edge, paths have not. Shapes of places: (n, size), of episodes: (n,). Raises `NotJudged` if there is none."""
+    edge, paths have not. Shapes of places: (n, size), of episodes: (n,). Raises `NotApplicable` if there is none."""
     size = places.shape[1]
     if size == 1:
         return _find_stops(places[:, 0], episodes)
@@ -145,7 +145,7 @@ def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
         if len(np.unique(nearest[is_far])) >= FEWEST_DIRECTIONS and len(np.unique(episodes[is_far])) >= FEWEST_EPISODES:
             how = f"the robot came {radii.max():.4g} away from there in many directions, and never farther"
             return Reach(centre.tolist(), float(radii.max()), how)
-    raise NotJudged("nothing limits where the robot gets")
+    raise NotApplicable("nothing limits where the robot gets")
 
 
 def _find_stops(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
@@ -155,7 +155,7 @@ def _find_stops(places: Numbers, episodes: NDArray[np.int64]) -> Reach:
     for stop in (low, high):
         is_there = (np.abs(places - stop) <= EDGE * (high - low)) & (np.abs(starts - stop) > SHARP * (high - low))
         if len(np.unique(episodes[is_there])) < FEWEST_STOPS:
-            raise NotJudged("nothing limits where the robot gets")
+            raise NotApplicable("nothing limits where the robot gets")
     how = f"the robot was stopped {(high - low) / 2:.4g} away from there on both sides"
     return Reach([(low + high) / 2], (high - low) / 2, how)
 

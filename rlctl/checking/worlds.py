@@ -60,6 +60,7 @@ class WorldBody:
 class JointActuator:
     """An actuator of MuJoCo that moves a joint."""
 
+    number: int  # Its place in ctrl
     name: str
     joint: Joint
     body: int

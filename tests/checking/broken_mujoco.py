@@ -286,6 +286,17 @@ class RL816ArmBeyondRange(MujocoArm):
     home, gain = np.zeros(3), 4.0
 
 
+class ArmWithJet(MujocoArm):
+    """Another actuator, the first one, pushes a site."""
+
+    xml = ARM.replace("<actuator>", '<actuator><general name="jet" site="tip" gear="0 0 1 0 0 0" ctrlrange="0 1"/>')
+
+
+class RL816ArmWithJetBeyondRange(ArmWithJet):
+    rlctl_ignore = {"RL805": "a consequence"}
+    home, gain = np.zeros(3), 4.0
+
+
 class RL816HopperTorqueBeyondRange(MujocoHopper):
     def move(self, action):
         self.data.ctrl[:] = 30.0 * action
@@ -385,3 +396,49 @@ class RL301HopperKeepsTime(MujocoHopper):
 class RL301HopperResets(RL301HopperKeepsTime):
     def clear(self):
         mujoco.mj_resetData(self.model, self.data)
+
+
+class ArmKeepsSpeed(MujocoArm):
+    """Sets its positions at reset, and nothing else."""
+
+    def clear(self): ...
+
+
+class HopperKeepsPlace(MujocoHopper):
+    """Observes where it is on the ground, where it continues after a reset."""
+
+    def clear(self):
+        self.kept = self.data.qpos[:2].copy()
+        super().clear()
+
+    def start(self):
+        super().start()
+        self.data.qpos[:2] = self.kept
+
+    def observe(self):
+        return np.append(super().observe(), self.data.qpos[:2])
+
+
+class ArmKeepsActivation(RL302ArmKeepsActivation):
+    """Observes the state of its actuator."""
+
+    def observe(self):
+        return np.append(super().observe(), self.data.act)
+
+
+class ArmKeepsMocap(MujocoArm):
+    """Moves a body that is placed by hand, and leaves it there."""
+
+    xml = ARM.replace("</worldbody>", '<body name="marker" mocap="true"/></worldbody>')
+
+    def clear(self):
+        kept = self.data.mocap_pos.copy()
+        super().clear()
+        self.data.mocap_pos[:] = kept
+
+    def move(self, action):
+        self.data.mocap_pos[0] += 0.1 * action
+        super().move(action)
+
+    def observe(self):
+        return np.append(super().observe(), self.data.mocap_pos)

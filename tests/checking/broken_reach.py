@@ -30,6 +30,26 @@ ARM = """
 """
 
 
+PLANAR = """
+<mujoco>
+  <option gravity="0 0 0" timestep="0.005"/>
+  <default><joint damping="0.3"/><geom type="capsule" size="0.02" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body pos="0 0 0.1" euler="{tilt} 0 0">
+      <joint name="shoulder" axis="0 0 1" range="-170 170" limited="true"/>
+      <geom fromto="0 0 0 0.3 0 0"/>
+      <body pos="0.3 0 0">
+        <joint name="elbow" axis="0 0 1" range="-150 150" limited="true"/>
+        <geom fromto="0 0 0 0.25 0 0"/>
+        <site name="hand" pos="0.25 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="shoulder"/><motor joint="elbow"/></actuator>
+</mujoco>
+"""
+
+
 class Arm(Robot):
     """An arm of three joints; its hand is at most 0.73 m from its base."""
 
@@ -134,3 +154,95 @@ class RL121ArmMovesItsGoal(Arm):
         to_goal = self.goal
         to_goal -= 0.01 * self.data.site("hand").xpos
         return np.concatenate([self.data.qpos, self.data.qvel, to_goal]).astype(np.float32)
+
+
+class PlanarArm(Arm):
+    """Its goal is a point in space, of which a constant is not observed: the height of the plane in which it moves."""
+
+    numbers = 2
+    near = 0.03  # [m]
+    tilt = 0  # of the plane [deg]
+    seen = (0, 1)
+    """The axes of the plane."""
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(PLANAR.format(tilt=self.tilt))
+        self.data = mujoco.MjData(self.model)
+        Robot.__init__(self)
+
+    def start(self):
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos = self.np_random.uniform(-1.0, 1.0, 2)
+        mujoco.mj_forward(self.model, self.data)
+        self.goal = self.draw_goal()
+
+    def draw_goal(self):
+        distance, angle = self.np_random.uniform(0.25, 0.5), self.np_random.uniform(-1.5, 1.5)
+        goal = np.array([0.0, 0.0, 0.1])
+        goal[list(self.seen)] += distance * np.array([np.cos(angle), np.sin(angle)])
+        return goal
+
+    def observe(self):
+        places = [place[list(self.seen)] for place in (self.data.site("hand").xpos, self.goal)]
+        return np.concatenate([self.data.qpos, self.data.qvel, *places]).astype(np.float32)
+
+
+class UprightArm(PlanarArm):
+    """Moves in a vertical plane, and sees its goal from its hand: the constant is in the middle."""
+
+    tilt, seen = 90, (0, 2)
+
+    def observe(self):
+        way = (self.goal - self.data.site("hand").xpos)[[0, 2]]
+        return np.concatenate([self.data.qpos, self.data.qvel, way]).astype(np.float32)
+
+
+class PlanarArmSeesAll(PlanarArm):
+    """Observes the constant too."""
+
+    def observe(self):
+        places = self.data.site("hand").xpos, self.goal
+        return np.concatenate([self.data.qpos, self.data.qvel, *places]).astype(np.float32)
+
+
+class PosedArm(PlanarArm):
+    """Its goal is a pose whose orientation is constant."""
+
+    def draw_goal(self):
+        return np.array([*super().draw_goal(), 1.0, 0.0, 0.0, 0.0])
+
+    def distance(self):
+        return float(np.linalg.norm(self.goal[:3] - self.data.site("hand").xpos))
+
+
+class RL622PlanarArmKeepsAway(RL622ArmKeepsAway, PlanarArm): ...
+
+
+class RL622UprightArmKeepsAway(RL622ArmKeepsAway, UprightArm): ...
+
+
+class RL622PosedArmKeepsAway(PosedArm):
+    def reward(self, action):
+        return self.distance() - 0.02 * np.square(action).sum()
+
+
+class RL619UprightArmFarGoals(UprightArm):
+    def draw_goal(self):
+        goal = super().draw_goal()
+        return goal + 0.6 * (goal - np.array([0.0, 0.0, 0.1]))
+
+
+class RL624PlanarArmInMillimetres(PlanarArm):
+    """Compares a distance in millimetres with a tolerance in metres."""
+
+    def distance(self):
+        return 1000 * super().distance()
+
+    def reward(self, action):
+        return -super().distance() - 0.02 * np.square(action).sum()
+
+
+class PlanarArmIsThere(PlanarArm):
+    """Its episodes end with their first step, in success."""
+
+    near = 10.0

@@ -442,3 +442,25 @@ class PusherIncrements(Increments, Pusher): ...
 
 
 class PusherIncrementsTooFar(TooFar, Pusher): ...
+
+
+class ArmKeepsJoints(Arm):
+    """Continues where it is after a reset."""
+
+    def start(self):
+        self.drive(self.home)
+
+
+class CrawlerKeepsBase(Crawler):
+    """Sets its joints at reset, and leaves its base where it is."""
+
+    def size(self):
+        return super().size() + 3
+
+    def start(self):
+        for joint, position in enumerate(self.home):
+            p.resetJointState(self.robot, joint, position, physicsClientId=self.client)
+
+    def observe(self):
+        velocity, _ = p.getBaseVelocity(self.robot, physicsClientId=self.client)
+        return np.concatenate([super().observe(), velocity]).astype(np.float32)

@@ -301,12 +301,24 @@ def test_a_strict_check_fails_for_rules_without_time_to_judge_them(report):
         (3, 3) if cut.built is None else (0, 1)
     )
     assert re.search(r": not finished: 1 of 5 rules not judged for lack of time .*; no findings", late.summarize())
+    assert "(needs --budget 40)" in late.summarize()
     assert "::warning title=1 rules not judged::time ran out for RL501" in FORMATS["github"](late)
     assert "time ran out" not in [case.get("name") for case in junit_cases(late)]
     (case,) = [
         each for each in junit_cases(dataclasses.replace(late, strict=True)) if each.get("name") == "time ran out"
     ]
     assert case.find("failure").get("message") == "no time to judge RL501: --budget 40"
+
+
+@pytest.mark.parametrize(("name", "is_shown"), [("desired_goal", True), ("Distance", True), ("joints", False)])
+def test_an_environment_with_a_goal_is_told_why_the_rules_about_goals_do_not_apply(name, is_shown):
+    leaves = find_leaves(spaces.Dict({name: spaces.Box(-1, 1, (2,))}))
+    records = Records("any", Built(leaves, leaves, "", ""))
+    reason = "the observation follows no attribute that reset draws"
+    others = {"RL622": reason, "RL623": reason, "RL808": "no PyBullet world"}
+    lines = to_text(CheckReport("any", CheckVerdict(not_applicable=others), records, 1.0, 20.0)).splitlines()
+    assert (f"does not apply: RL622, RL623: {reason}" in lines) is is_shown
+    assert "does not apply: RL622, RL623, RL808 (reasons: --json FILE)" in lines
 
 
 def test_a_check_without_a_quarter_of_the_rules_is_no_pass(broken):

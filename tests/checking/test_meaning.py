@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from rlctl.checking.rates import find_rates
-from rlctl.checking.rule import NotJudged
+from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
 from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import case, check_case, findings, mark_slow, shared_records_of
+from tests.checking.judging import case, check_case, findings, mark_slow, shared_records_of, verdict_of
 
 MEANING, REACH = "broken_meaning.py", "broken_reach.py"
 
@@ -43,6 +43,10 @@ CASES = [
     broken("RL121ArmMovesItsGoal", ("RL121", "warning"), twin="Arm", file=REACH, slow=True),
     broken("RL622ArmKeepsAway", ("RL622", "warning"), twin="Arm", file=REACH),
     broken("RL622RoverKeepsAway", ("RL605", "warning"), ("RL622", "warning"), twin="Rover", slow=True),
+    broken("RL622PlanarArmKeepsAway", ("RL622", "warning"), twin="PlanarArm", file=REACH),
+    broken("RL622UprightArmKeepsAway", ("RL622", "warning"), twin="UprightArm", file=REACH, slow=True),
+    broken("RL622PosedArmKeepsAway", ("RL622", "warning"), twin="PosedArm", file=REACH, slow=True),
+    broken("RL619UprightArmFarGoals", ("RL619", "warning"), twin="UprightArm", file=REACH, slow=True),
     broken("RL623RoverShakes", ("RL623", "warning"), twin="RL623RoverComesNearer"),
     broken("RL623ArmShakes", ("RL623", "warning"), twin="RL623ArmComesNearer", file=REACH, slow=True),
     broken("RL119RoverMillimetres", ("RL118", "info"), ("RL119", "warning"), twin="Rover", slow=True),
@@ -66,6 +70,38 @@ def test_goals_without_a_seed_are_not_judged():
         shared_records_of(f"{REACH}:ArmByChance", "goals").require_fact("goals")
 
 
+@pytest.mark.parametrize(
+    ("name", "elements"),
+    [("PlanarArm", (0, 1)), ("UprightArm", (0, 2)), ("PlanarArmSeesAll", (0, 1, 2)), ("PosedArm", (0, 1))],
+)
+def test_a_goal_is_what_reset_draws_of_an_attribute(name, elements):
+    goals = shared_records_of(f"{REACH}:{name}", "goals").require_fact("goals")
+    assert goals.place.name == "self.goal"
+    assert goals.place.elements == elements
+    assert len(goals.goals[1000]) == len(elements)
+
+
+@pytest.mark.parametrize("name", ["PlanarArm", "UprightArm", "PlanarArmSeesAll", "PosedArm"])
+def test_goals_with_a_constant_are_judged_and_sound(name):
+    rules = ["RL125", "RL622", "RL623", "RL624", "RL625"]
+    verdict = verdict_of(f"{REACH}:{name}", *rules)
+    assert verdict.findings == []
+    assert verdict.judged == rules
+
+
+def test_the_reach_is_measured_along_the_axes_that_are_drawn():
+    goals = shared_records_of(f"{REACH}:UprightArm", "goals").require_fact("goals")
+    (reach,) = goals.reaches.values()
+    assert reach.distance == pytest.approx(0.55, abs=0.001)  # 0.3 m and 0.25 m
+    assert reach.centre == pytest.approx([0.0, 0.1])  # along x and z
+
+
+def test_goals_that_are_reached_at_once_are_none_to_come_nearer_to():
+    verdict = verdict_of(f"{REACH}:PlanarArmIsThere", "RL623")
+    # More time would change nothing, so that it is not counted among the rules that lack time.
+    assert verdict.not_applicable == {"RL623": "episodes are too short, or begin with a success"}
+
+
 def test_what_the_joints_do_not_move_is_not_the_hand():
     goals = shared_records_of(f"{REACH}:ArmUnclearReward", "goals").require_fact("goals")
     (reach,) = goals.reaches.values()  # where the goal itself is observed, its difference to itself is the base
@@ -76,7 +112,7 @@ def test_the_reach_of_a_task_in_mujoco_is_measured_by_its_joints():
     with contextlib.closing(EnvSpec("reach", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         *_, chain = find_chains(env)  # other tests may have left PyBullet's
-        reach = measure_reach(chain, chain.names.index("arm/lbr_iiwa_link_7"), 3)
+        reach = measure_reach(chain, chain.names.index("arm/lbr_iiwa_link_7"), range(3))
     # The stretched arm: 0.9 m from the shoulder, which is 0.2 m above the first joint.
     assert reach.distance == pytest.approx(1.1, abs=0.01)
     assert reach.centre == pytest.approx([0, 0, 0.16], abs=0.01)
@@ -152,5 +188,5 @@ def test_edge_of_a_workspace_is_found_and_a_path_has_none():
     assert reach.centre == pytest.approx([1.0, -1.0], abs=0.05)
     assert reach.distance == pytest.approx(2.0, abs=0.05)
     walk = np.cumsum(rng.normal(size=(20, 100, 2)), axis=1).reshape(-1, 2)
-    with pytest.raises(NotJudged):
+    with pytest.raises(NotApplicable):
         find_reach(walk, episodes)

@@ -45,6 +45,7 @@ CASES = [
     broken("RL815ArmForwardTooEarly", "RL815", slow=True),
     broken("RL815HopperStateInTheLoop", "RL815", slow=True),
     broken("RL816ArmBeyondRange", "RL816", slow=True),
+    broken("RL816ArmWithJetBeyondRange", "RL816", twin="ArmWithJet", slow=True),
     broken("RL816HopperTorqueBeyondRange", "RL816", twin="RL816HopperTorque", slow=True),
     broken("RL817ArmGrowsHeavy", "RL817", "error", "RL817ArmNominalMass", slow=True),
     broken("RL817HopperSlips", "RL817", "error", "RL817HopperFriction", slow=True),
@@ -112,6 +113,7 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
         ("RL815ArmResetsWithoutForward", "RL815", ("of reset", "before mj_forward")),
         ("RL815HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),
         ("RL816ArmBeyondRange", "RL816", ("only", "of the action's range")),
+        ("RL816ArmWithJetBeyondRange", "RL816", ("ctrl[3] (bend)", "turn, lift")),
         ("RL817ArmGrowsHeavy", "RL817", ("body_mass[1] (upper)",)),
         ("RL817HopperSlips", "RL817", ("geom_friction[", ", 0]")),
         ("RL302ArmKeepsActivation", "RL302", ("reset keeps state (data.act",)),
@@ -122,6 +124,25 @@ def test_finding_names_what_is_wrong(name, rule, words):
     task = f"broken_mujoco_{name}" if name.startswith("joints.py") else f"broken_mujoco.py:{name}"
     messages = " ".join(finding.message for finding in findings(task, rule))
     assert [word for word in words if word not in messages] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [
+        ("ArmKeepsSpeed", "data.qvel[0]"),
+        ("HopperKeepsPlace", "data.qpos[0]"),
+        ("ArmKeepsActivation", "data.act[0]"),
+        ("ArmKeepsMocap", "data.mocap_pos[0, "),
+    ],
+)
+def test_kept_state_that_is_observed_is_named_first(name, kept):
+    (finding,) = findings(f"broken_mujoco.py:{name}", "RL301")
+    field = kept.partition("[")[0]
+    assert f"reset keeps state ({field}" in finding.message
+    assert f"; {finding.evidence['element']} is {kept}" in finding.message
+    assert finding.fix.startswith(f"Set back in reset: {field}")
+    assert finding.fix.endswith("mujoco.mj_resetData(model, data) sets back all of data.")
 
 
 @pytest.mark.slow

@@ -91,3 +91,16 @@ def test_joints_that_default_motors_hold_are_named():
     assert finding.message.startswith("shoulder, elbow, wrist get torques, and PyBullet's default motors hold them")
     assert finding.evidence["torque"] == pytest.approx(3.0, rel=0.01)
     assert findings("broken_robots.py:ArmDriven", "RL821") == []
+
+
+@pytest.mark.pybullet
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "kept"),
+    [("ArmKeepsJoints", "joint speeds of arm"), ("CrawlerKeepsBase", "orientation of crawler")],
+)
+def test_state_of_bodies_that_reset_keeps_is_named(name, kept):
+    (finding,) = findings(f"broken_robots.py:{name}", "RL301")
+    assert f"reset keeps state ({kept}, " in finding.message
+    assert f"; {finding.evidence['element']} is {kept}" in finding.message
+    assert "resetBaseVelocity set back bodies of PyBullet" in finding.fix

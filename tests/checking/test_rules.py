@@ -183,7 +183,10 @@ def test_difference_is_named():
 @pytest.mark.slow
 def test_state_that_reset_keeps_is_named():
     (finding,) = findings("broken_repeats.py:OldActions", "RL301")
-    assert finding.message.endswith("; a new process repeats it, so reset keeps state (self.actions, self.position)")
+    element = finding.evidence["element"]
+    keeps = f"reset keeps state (self.position, self.actions); {element} is self.position"
+    assert finding.message.endswith(f"; a new process repeats it, so {keeps}{element.removeprefix('observation')}")
+    assert finding.fix == "Set back in reset: self.position, self.actions."
 
 
 def test_state_without_effect_is_not_named():

@@ -31,6 +31,13 @@ CASES = [
     broken("RL624ArmTolerance", "mujoco_robots.py:MujocoArm", "RL624"),
     broken("RL624ReachTolerance", "broken_reach.py:Arm", "RL624"),
     broken("RL624ReacherTolerance", REACHER, "RL624", pybullet=True),
+    case(
+        "broken_reach.py:RL624PlanarArmInMillimetres",
+        ("RL624", "warning"),
+        ("RL611", "info"),
+        twin="broken_reach.py:PlanarArm",
+        slow=True,
+    ),
     broken("RL119RoverCentimetres", "broken_meaning.py:Rover", "RL119"),
     broken("RL119DroneCentimetres", "broken_meaning.py:Drone", "RL119"),
     broken("RL119ArmCentimetres", "mujoco_robots.py:MujocoArm", "RL119"),

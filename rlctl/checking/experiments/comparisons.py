@@ -6,10 +6,9 @@ from rlctl.checking.differences import COMPARED_STEPS
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
-from rlctl.checking.mujoco_worlds import read_kept_fields
+from rlctl.checking.kept_state import KeptState, find_kept, read_state
 from rlctl.checking.recording import Recording
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
-from rlctl.checking.values import find_unequal, read_attributes
 
 DIRTY_STEPS = 37  # longest unfinished episode before a repetition
 KEPT_STEPS = 10  # So many steps are between two resets whose attributes are compared
@@ -36,12 +35,11 @@ def compare_repetitions(context: Context) -> Iterator[ChildMessage]:
     yield Fact("kept", _find_kept(instance))
 
 
-def _find_kept(instance: Instance) -> list[str]:
+def _find_kept(instance: Instance) -> list[KeptState]:
     read = []
     for steps in (0, KEPT_STEPS, 0):
-        instance.reset(FIRST_SEED)
-        read.append(read_attributes(instance.env) | read_kept_fields(instance.env))
+        moment = EpisodePlayer(instance, FIRST_SEED, max_steps=0).reset()
+        read.append(read_state(instance.env, instance.leaves, moment.observation))
         for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=steps):
             pass
-    kept, every_time = find_unequal(*read[1:]), find_unequal(*read[:2])  # a clock differs every time
-    return [name for name in kept if name not in every_time] or kept
+    return find_kept(*read)

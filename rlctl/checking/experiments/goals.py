@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from rlctl.checking.workspaces import Reach, find_chains, measure_reach
 from rlctl.environments.success import SUCCESS
 
 SIZES = (1, 2, 3)  # of a place [numbers]
+SPACE = 3  # axes of the world
 MOST_CANDIDATES = 6
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
@@ -42,14 +44,60 @@ TURN_SHIFT, TURN_ERROR = 0.1, 1e-3  # of a goal along each axis, to see how the 
 
 
 @dataclasses.dataclass(frozen=True)
+class DrawnPlace:
+    """Elements of an attribute: a whole place, or what a reset draws of it where the rest is constant."""
+
+    name: str  # of the attribute
+    elements: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """How many numbers the place has."""
+        return len(self.elements)
+
+    @property
+    def axes(self) -> list[int]:
+        """The axes of the world that the elements are, where places of links are compared with them."""
+        return list(self.elements if max(self.elements) < SPACE else range(self.size))
+
+    def find(self, env: Any) -> Attribute:
+        """Return the attribute, with a copy of its present value."""
+        return read_attributes(env)[self.name]
+
+    def read(self, env: Any) -> Numbers:
+        """Return the place. Shape (size,)."""
+        return self.pick(self.find(env))
+
+    def pick(self, attribute: Attribute) -> Numbers:
+        """Return the place that an attribute has. Shape (size,)."""
+        return attribute.numbers[list(self.elements)]
+
+    def assign(self, attribute: Attribute, place: Numbers) -> None:
+        """Replace the place in the environment; the other elements become those of the copy."""
+        numbers = attribute.numbers.copy()
+        numbers[list(self.elements)] = place
+        attribute.assign(shape_like(attribute.value, numbers))
+
+
+@dataclasses.dataclass(frozen=True)
 class DrawnGoal:
     """A place that each reset draws."""
 
-    name: str  # of the attribute
+    place: DrawnPlace
     copies: Sequence[Source]  # Where the observation has it, or its difference to something
     turned: Sequence[Source]  # Where the observation has its difference to something, turned
     goals: Mapping[int, Sequence[float]]  # by seed
     reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
+
+    @property
+    def name(self) -> str:
+        """The name of the attribute."""
+        return self.place.name
+
+    def name_axis(self, axis: int) -> str:
+        """Name an element of the place: `self.goal[1]`."""
+        is_number = self.place.elements == (0,)
+        return self.name if is_number else f"{self.name}[{self.place.elements[axis]}]"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +181,7 @@ class GoalTrials:
             return {}
         places: dict[str, Numbers] = {}
         for chain in find_chains(self.instance.env):
-            places |= dict(zip(chain.names, chain.read()[:, : episode.goal.size], strict=True))
+            places |= dict(zip(chain.names, chain.read()[:, self.drawn.place.axes], strict=True))
         return places
 
     def succeeds(self, seed: int, goal: Numbers) -> bool | None:
@@ -160,8 +208,9 @@ class GoalEpisode:
         self._instance = trials.instance
         self._player = EpisodePlayer(self._instance, seed, actions)
         moment = self._player.reset()
-        self._attribute = read_attributes(self._instance.env)[trials.drawn.name]
-        self.goal = self._attribute.numbers
+        self._place = trials.drawn.place
+        self._attribute = self._place.find(self._instance.env)
+        self.goal = self._place.pick(self._attribute)
         self.observed = flatten_floats(self._instance.leaves, moment.observation)  # Shape (elements,)
         self.has_succeeded = False  # whether any of its steps was a success
         self.play([None] * first)
@@ -174,7 +223,7 @@ class GoalEpisode:
     def step(self, goal: Numbers | None = None) -> GoalStep:
         """Set the goal, if one is given, and take a step."""
         if goal is not None:
-            self._attribute.assign(shape_like(self._attribute.value, goal))
+            self._place.assign(self._attribute, goal)
             self.goal = goal
         self._goals.append(goal)
         moment = self._player.step()
@@ -242,41 +291,42 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
     instance = context.instance
     if not instance.accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
-    names, by_chance = _find_drawn(instance)
-    for name in names:
-        copies, turned = _find_copies(instance, name), _find_turned(instance, name)
+    places, by_chance = _find_drawn(instance)
+    for place in places:
+        copies, turned = _find_copies(instance, place), _find_turned(instance, place)
         if copies or turned:
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
                 if context.budget.why_spent():
                     break
                 instance.reset(seed)
-                goals[seed] = read_attributes(instance.env)[name].numbers.tolist()
-            drawn = DrawnGoal(name, copies, turned, goals, _find_reaches(instance, name, copies))
+                goals[seed] = place.read(instance.env).tolist()
+            drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies))
             yield Fact("goals", drawn)
             yield from judges_goals.judge(GoalTrials(instance, drawn))
             return
-    yield from _find_scaled(instance, names)
+    yield from _find_scaled(instance, places)
     if by_chance:
         raise NotJudged("the seed does not determine what reset draws (RL301)")
     raise NotApplicable("the observation follows no attribute that reset draws")
 
 
-def _find_scaled(instance: Instance, names: Sequence[str]) -> Iterator[Fact]:
+def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[Fact]:
     """Yield the first attribute that the observation shows in a smaller unit."""
-    for name in names:
+    for place in places:
         for factor in SMALLER_UNITS:
-            if copies := _find_copies(instance, name, factor):
-                seen = _observe(instance, name, 0.0)[copies[0][0] :][: read_attributes(instance.env)[name].numbers.size]
-                yield Fact(SCALED_GOAL, ScaledGoal(name, copies[0][0], factor, float(np.linalg.norm(seen))))
+            if copies := _find_copies(instance, place, factor):
+                seen = _observe(instance, place, 0.0)[copies[0][0] :][: place.size]
+                yield Fact(SCALED_GOAL, ScaledGoal(place.name, copies[0][0], factor, float(np.linalg.norm(seen))))
                 return
 
 
-def _find_drawn(instance: Instance) -> tuple[list[str], list[str]]:
-    """Return the attributes of the size of a place that a reset draws by its seed and no step changes, and the others
+def _find_drawn(instance: Instance) -> tuple[list[DrawnPlace], list[str]]:
+    """Return the places in attributes that a reset draws by its seed and no step changes, and the names of the others
     that it draws."""
     again, *drawn = (_read_after_reset(instance, seed) for seed in (FIRST_SEED, FIRST_SEED, SECOND_SEED))
-    names = [name for name in drawn[0].keys() & drawn[1].keys() if _is_place(drawn[0][name], drawn[1][name])]
+    places = {name: _list_places(drawn[0][name], drawn[1][name]) for name in drawn[0].keys() & drawn[1].keys()}
+    names = [name for name, found in places.items() if found]
     seeded = [name for name in names if name in again and np.array_equal(again[name].numbers, drawn[0][name].numbers)]
     by_chance = sorted({*names} - {*seeded})
     if not seeded:
@@ -285,7 +335,8 @@ def _find_drawn(instance: Instance) -> tuple[list[str], list[str]]:
         pass
     after = read_attributes(instance.env)
     stays = [name for name in seeded if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
-    return sorted(stays)[:MOST_CANDIDATES], by_chance
+    candidates = sorted(stays, key=lambda name: (drawn[0][name].numbers.size not in SIZES, name))[:MOST_CANDIDATES]
+    return [place for name in candidates for place in places[name]], by_chance
 
 
 def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
@@ -293,20 +344,29 @@ def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
     return read_attributes(instance.env)
 
 
-def _is_place(one: Attribute, two: Attribute) -> bool:
+def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
+    """Return the whole of an attribute if it may be a place, and then what two resets drew of it."""
     if np.asarray(one.value).dtype.kind != "f":
-        return False  # whole numbers are states and cells: an environment looks them up in tables
-    sizes = one.numbers.size, two.numbers.size
-    return sizes[0] == sizes[1] and sizes[0] in SIZES and int((one.numbers != two.numbers).sum()) >= min(2, sizes[0])
+        return []  # whole numbers are states and cells: an environment looks them up in tables
+    size = one.numbers.size
+    if size != two.numbers.size:
+        return []
+    drawn = tuple(np.flatnonzero(one.numbers != two.numbers).tolist())
+    if len(drawn) not in SIZES or len(drawn) < min(2, size):
+        return []
+    found = [DrawnPlace(one.name, tuple(range(size)))] if size in SIZES else []
+    if len(drawn) < size:
+        found.append(DrawnPlace(one.name, drawn))
+    return found
 
 
-def _find_copies(instance: Instance, name: str, factor: float = 1.0) -> list[tuple[int, int]]:
+def _find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
     """Return where the observation has the place, or its difference to something, times a factor; and the sign."""
-    before, plain, shifted = (_observe(instance, name, shift) for shift in (0.0, 0.0, 1.0))
+    before, plain, shifted = (_observe(instance, place, shift) for shift in (0.0, 0.0, 1.0))
     if before.shape != plain.shape or plain.shape != shifted.shape:
         return []
     noise = np.minimum(np.abs(plain - before), MOST_NOISE)  # an engine may keep contacts of the episode before
-    change, shift = shifted - plain, factor * SHIFT[: read_attributes(instance.env)[name].numbers.size]
+    change, shift = shifted - plain, factor * SHIFT[: place.size]
     parts = [change[element : element + len(shift)] for element in range(len(change) - len(shift) + 1)]
     allowed = ROUNDING + PART * np.abs(plain) + 2 * noise
     most = [allowed[i : i + len(shift)].max() for i in range(len(parts))]
@@ -315,11 +375,11 @@ def _find_copies(instance: Instance, name: str, factor: float = 1.0) -> list[tup
     ]
 
 
-def _find_turned(instance: Instance, name: str) -> list[Source]:
+def _find_turned(instance: Instance, place: DrawnPlace) -> list[Source]:
     """Return where the observation has the way to the place in a frame that is turned against the world's."""
-    size = read_attributes(instance.env)[name].numbers.size
-    plain = _observe(instance, name, 0.0)
-    shifted = [_observe(instance, name, 1.0, TURN_SHIFT * axis) for axis in np.eye(size)]
+    size = place.size
+    plain = _observe(instance, place, 0.0)
+    shifted = [_observe(instance, place, 1.0, TURN_SHIFT * axis) for axis in np.eye(size)]
     if size < 2 or any(row.shape != plain.shape for row in shifted):
         return []
     turns = np.stack([row - plain for row in shifted]) / TURN_SHIFT  # shape (size, elements)
@@ -333,23 +393,22 @@ def _find_turned(instance: Instance, name: str) -> list[Source]:
     return found
 
 
-def _observe(instance: Instance, name: str, shift: float, along: Numbers = SHIFT) -> Numbers:
+def _observe(instance: Instance, place: DrawnPlace, shift: float, along: Numbers = SHIFT) -> Numbers:
     """Return the observation of the first step if the place is shifted before it. Shape (elements,)."""
     episode = EpisodePlayer(instance, FIRST_SEED, "zero", max_steps=1)
     episode.reset()
-    attribute = read_attributes(instance.env)[name]
-    moved = attribute.numbers + shift * along[: attribute.numbers.size]
-    attribute.assign(shape_like(attribute.value, moved))
+    attribute = place.find(instance.env)
+    place.assign(attribute, place.pick(attribute) + shift * along[: place.size])
     return flatten_floats(instance.leaves, episode.step().observation)
 
 
-def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> dict[Source, Reach]:
+def _find_reaches(instance: Instance, place: DrawnPlace, copies: Sequence[Source]) -> dict[Source, Reach]:
     """Return how far the links of fixed robots get whose places are observed, by where they are observed."""
     rows, goals, links = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + COMPARED):
         first = EpisodePlayer(instance, seed, max_steps=0).reset()
         rows.append(flatten_floats(instance.leaves, first.observation))
-        goals.append(read_attributes(instance.env)[name].numbers)
+        goals.append(place.read(instance.env))
         chains = list(find_chains(instance.env))
         if not chains:
             return {}
@@ -359,10 +418,10 @@ def _find_reaches(instance: Instance, name: str, copies: Sequence[Source]) -> di
     for source in find_sources(copies, observed, drawn):
         places = read_place(source, observed, drawn)
         for number, chain in enumerate(chains):
-            off = np.abs(np.array([one[number] for one in links])[:, :, : drawn.shape[1]] - places[:, None])
+            off = np.abs(np.array([one[number] for one in links])[:, :, place.axes] - places[:, None])
             link = int(off.max(axis=(0, 2)).argmin())
             if off[:, link].max() < NEAR and source not in reaches:
-                reach = measure_reach(chain, link, drawn.shape[1])
+                reach = measure_reach(chain, link, place.axes)
                 # A goal minus itself is the origin, where the base of many robots is.
                 reaches |= {source: reach} if reach.distance > NEAR else {}
     return reaches

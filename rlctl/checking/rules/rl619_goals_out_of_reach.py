@@ -10,7 +10,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.goals import DrawnGoal, Numbers, Source, find_sources, read_place
 from rlctl.checking.records import Records
 from rlctl.checking.regression import action_terms, fit_terms
-from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, sample_ordinary_steps
 from rlctl.checking.workspaces import Reach, find_reach
 
@@ -46,7 +46,7 @@ def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     try:
         places, of, tolerance = _find_robot(steps, goals, drawn)
         reach = drawn.reaches.get(of) or find_reach(places, steps.episodes)
-    except NotJudged:
+    except (NotJudged, NotApplicable):
         # Rewards may not tell where the robot is; that a link is observed relative to goals far away tells enough.
         known, tolerance = [reach for (_, sign), reach in drawn.reaches.items() if sign], None
         if not known or _measure_distances(drawn, known[0]).min() < VERY_FAR * known[0].distance:

@@ -135,8 +135,7 @@ def _describe_way(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float
 
 
 def _name_axes(trials: GoalTrials, axes: Sequence[int]) -> str:
-    name = trials.drawn.name
-    return list_names([f"{name}[{axis}]" for axis in axes]) if trials.goals.shape[1] > 1 else name
+    return list_names([trials.drawn.name_axis(axis) for axis in axes])
 
 
 def _find_source(trials: GoalTrials) -> tuple[Source | None, bool]:

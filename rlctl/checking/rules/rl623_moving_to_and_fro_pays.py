@@ -39,7 +39,7 @@ def _move_to_and_fro(trials: GoalTrials) -> Iterator[ChildMessage]:
         if _is_complete(one):
             break
     else:
-        yield Skipped(RULE.id, "episodes are too short, or begin with a success")
+        yield Skipped(RULE.id, "episodes are too short, or begin with a success", applies=False)
         return
     for direction in DIRECTIONS[:, : near.size]:
         way = PART * trials.range * direction

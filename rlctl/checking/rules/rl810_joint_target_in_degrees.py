@@ -126,9 +126,8 @@ def find_ranges_in_degrees(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding
             span, joint = found[0], found[0].motor.joint
             names = list_names([other.motor.joint.name for other in found])
             limits = f"the limits of joint {joint.name}, [{joint.low:.3g}, {joint.high:.3g}] rad, {what}"
-            message = (
-                f"action[{span.element}] drives ctrl[{span.number}] over [{span.low:.4g}, {span.high:.4g}]: {limits}"
-            )
+            drives = f"action[{span.element}] drives ctrl[{span.motor.number}] over [{span.low:.4g}, {span.high:.4g}]"
+            message = f"{drives}: {limits}"
             evidence = {"element": joint.name, "value": [span.low, span.high], "expected": [joint.low, joint.high]}
             yield RuleFinding(RULE, f"{message} (so are those of {names})" if len(found) > 1 else message, evidence)
             return

@@ -81,7 +81,8 @@ def _find_other_starts(trial: MotorTrial) -> Iterator[RuleFinding]:
     if exchanged := trial.find_exchanged(is_equal):
         motor, joint = next(iter(exchanged.items()))
         own, other = trial.motors[motor].joint.name, trial.joints[joint].name
-        what = f"with the zero action the first target of joint {own}, ctrl[{motor}], is the start of joint {other}"
+        target_of = f"the first target of joint {own}, ctrl[{trial.motors[motor].number}]"
+        what = f"with the zero action {target_of}, is the start of joint {other}"
         message = f"{what} in all {SEEDS} resets{trial.name_others(exchanged)}"
         start, target = float(starts[0, trial.own[motor]]), float(targets[0, motor])
         evidence = {"seed": FIRST_SEED, "step": 1, "element": own, "value": target, "expected": start}
@@ -133,7 +134,7 @@ def _is_feedback(motors: Sequence[JointActuator], answers: Array, exchanged: Map
 def _describe_feedback(trial: MotorTrial, exchanged: Mapping[int, int], what: str) -> RuleFinding:
     motor, joint = next(iter(exchanged.items()))
     own, other = trial.motors[motor].joint.name, trial.joints[joint].name
-    follows = f"ctrl[{motor}], of the actuator of joint {own}, follows the {what} of joint {other}"
+    follows = f"ctrl[{trial.motors[motor].number}], of the actuator of joint {own}, follows the {what} of joint {other}"
     message = f"{follows}, not of its own joint{trial.name_others(exchanged)}"
     evidence = {"seed": FIRST_SEED, "element": trial.motors[motor].name, "value": other, "expected": own}
     return RuleFinding(RULE, message, evidence)
@@ -164,11 +165,11 @@ def _find_other_ranges(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:
     for span, other in itertools.permutations(holding, 2):
         if covers(span, other.motor) and not covers(span, span.motor) and not covers(span, span.motor, DEGREE):
             swapped.append((span, other))
-    if len({span.number for span, _ in swapped}) >= 2:
+    if len({span.motor.number for span, _ in swapped}) >= 2:
         span, other = swapped[0]
         joint, reach = span.motor.joint, other.motor.joint
         limits = f"over [{span.low:.3g}, {span.high:.3g}], the limits of joint {reach.name}"
         own = f"those of its own joint {joint.name} are [{joint.low:.3g}, {joint.high:.3g}]"
-        message = f"action[{span.element}] drives ctrl[{span.number}] {limits}; {own}"
+        message = f"action[{span.element}] drives ctrl[{span.motor.number}] {limits}; {own}"
         evidence = {"element": span.motor.name, "value": [span.low, span.high], "expected": [joint.low, joint.high]}
         yield RuleFinding(RULE, message, evidence)

@@ -80,7 +80,7 @@ def _find_kept_commands(trial: MotorTrial) -> Iterator[RuleFinding]:
         stuck = {motor: _count_stuck(later, motor, *bounds) for motor, bounds in beyond.items()}
         motor = max(stuck, key=lambda motor: stuck[motor])
         if stuck[motor] >= FEWEST_STUCK:
-            yield _describe_kept(trial.motors[motor], motor, float(last[motor]), which, steps, stuck[motor])
+            yield _describe_kept(trial.motors[motor], float(last[motor]), which, steps, stuck[motor])
             return
 
 
@@ -185,8 +185,8 @@ def _count_stuck(commands: Sequence[Array | None], motor: int, low: float, high:
     return inside.index(True) if True in inside else len(inside)
 
 
-def _describe_kept(motor: JointActuator, number: int, target: float, which: str, steps: int, stuck: int) -> RuleFinding:
-    what = f"the {which} action, held for {steps} steps, brings ctrl[{number}] ({motor.name}) to {target:.4g}"
+def _describe_kept(motor: JointActuator, target: float, which: str, steps: int, stuck: int) -> RuleFinding:
+    what = f"the {which} action, held for {steps} steps, brings ctrl[{motor.number}] ({motor.name}) to {target:.4g}"
     range_ = f"its ctrlrange is [{motor.low:.4g}, {motor.high:.4g}], to which MuJoCo clamps it silently"
     message = f"{what}; {range_}: the opposite action then changes nothing for {stuck} steps"
     evidence = {"seed": FIRST_SEED, "step": steps, "element": motor.name, "value": target}
@@ -203,9 +203,8 @@ def _find_clamped(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:
             clamped.append((inside, span))
     if clamped:
         inside, span = min(clamped, key=lambda pair: pair[0])
-        what = (
-            f"action[{span.element}] sets ctrl[{span.number}] ({span.motor.name}) to [{span.low:.4g}, {span.high:.4g}]"
-        )
+        target = f"ctrl[{span.motor.number}] ({span.motor.name})"
+        what = f"action[{span.element}] sets {target} to [{span.low:.4g}, {span.high:.4g}]"
         range_ = f"its ctrlrange is [{span.motor.low:.4g}, {span.motor.high:.4g}], to which MuJoCo clamps it silently"
         others = [other.motor.name for _, other in clamped if other is not span]
         more = f"; so for {list_names(others)}" if others else ""
