@@ -186,6 +186,14 @@ class Pile(Task):
         return {"height": 0.0}
 
 
+class Stadium(Slider):
+    """The same on a ground of `pybullet_data`, an SDF file, which MuJoCo does not read."""
+
+    def build(self, sim: Sim) -> None:
+        super().build(sim)
+        sim.load("ground", "plane_stadium.sdf")
+
+
 class Cubes(Pile):
     """Five cubes only."""
 

@@ -118,6 +118,23 @@ def test_feet_have_the_spinning_friction_of_their_file():
     assert spins[:-2] == pytest.approx(0.0, abs=1e-4)
 
 
+def test_inverse_kinematics_depend_on_the_present_joints_and_model_only(tmp_path):
+    hand, wanted, down = "lbr_iiwa_link_7", np.array([0.5, 0.2, 0.5]), (1.0, 0.0, 0.0, 0.0)
+    home = np.array([0.0, 0.5, 0.0, -1.2, 0.0, 0.9, 0.0])
+    with closing(MujocoSim(control_dt=1 / 60, substeps=4)) as sim:
+        arm = sim.load("arm", "kuka_iiwa.urdf", fixed=True)
+        arm.set_joints(home)
+        first = arm.solve_inverse_kinematics(hand, wanted, down)
+        arm.solve_inverse_kinematics(hand, [0.4, -0.3, 0.6])
+        assert arm.joint_positions == pytest.approx(home)
+        assert np.array_equal(arm.solve_inverse_kinematics(hand, wanted, down), first)
+        sim.load("cart", models.cart(tmp_path))  # a free body: the model has more joints now
+        arm.set_joints(home)
+        assert arm.solve_inverse_kinematics(hand, wanted, down) == pytest.approx(first, abs=1e-9)
+        arm.set_joints(first)
+        assert arm.link_position(hand) == pytest.approx(wanted, abs=2e-4)
+
+
 @pytest.mark.pybullet
 @pytest.mark.parametrize("world", [PybulletSim, MujocoSim])
 def test_a_force_sensor_measures_what_hangs_from_it(world):
@@ -157,7 +174,7 @@ def test_events_act_in_mujoco_too():
 @pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("task", "parameters", "missing"),
-    [("kuka-grasp", {}, "kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF")],
+    [("tests.task.tasks:Stadium", {}, "plane_stadium.sdf: MuJoCo reads URDF and MJCF")],
 )
 def test_what_mujoco_has_not_is_named(task, parameters, missing):
     with pytest.raises(TaskError, match=missing):

@@ -72,6 +72,7 @@ class MujocoWorld:
         self.substeps, self.count = substeps, count
         self.mj_model: Any
         self.mj_data: Any
+        self._scratch: Any = None
         self.batch: Any = None
         self.extra: dict[str, Array] = {}
         """Arrays by name, without the leading axis of worlds."""
@@ -86,10 +87,17 @@ class MujocoWorld:
 
     def set_model(self, model: Any, data: Any) -> None:
         """Use a newly compiled model; there is one world until `save`."""
-        self.mj_model, self.mj_data = model, data
+        self.mj_model, self.mj_data, self._scratch = model, data, None
         self.batch, self._saved, self._is_fresh = None, None, False
         self._built.clear()
         self._rows.clear()
+
+    @property
+    def scratch(self) -> Any:
+        """A second MjData of the model, to compute with other positions; what is in it is of the last use."""
+        if self._scratch is None:  # to make one takes as long as some physics steps
+            self._scratch = self.mujoco.MjData(self.mj_model)
+        return self._scratch
 
     def data(self, name: str) -> Any:
         """Return an array of MjData; those that are derived are valid after `refresh`."""
