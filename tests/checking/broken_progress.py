@@ -3,7 +3,7 @@ Others pay for success, or take something for it."""
 
 import numpy as np
 import pybullet as p
-from broken_turned import Cart, CrawlerLooks, Flyer, Puck
+from broken_turned import Cart, Flyer, Puck
 from mujoco_robots import MujocoArm, MujocoHopper
 from robots import Boat
 
@@ -104,17 +104,6 @@ class HopperSeeks(Seeks, MujocoHopper):
 
 
 class RL125HopperTurnsBack(TurnsBack, HopperSeeks): ...
-
-
-class RL622HopperGoesAway(GoesAway, HopperSeeks): ...
-
-
-class CrawlerSeeks(InBullet, Seeks, CrawlerLooks):
-    rlctl_ignore = {**CrawlerLooks.rlctl_ignore, "RL625": "it crawls a few centimetres in an episode"}
-
-
-class RL125CrawlerTurnsBack(InBullet, TurnsBack, Seeks, CrawlerLooks):
-    rlctl_ignore = CrawlerSeeks.rlctl_ignore
 
 
 class PuckSeeks(InBullet, Seeks, Puck): ...

@@ -2,7 +2,7 @@
 
 import numpy as np
 from broken_meaning import Drone, Rover
-from broken_progress import BoatSeeks, CartSeeks, FlyerSeeks, PuckSeeks
+from broken_progress import BoatSeeks, FlyerSeeks
 from broken_reach import Arm as Reach
 from broken_reach_bullet import Reacher
 from mujoco_robots import MujocoArm, MujocoHopper
@@ -39,12 +39,6 @@ class RL625BoatOnePercent(OnePercent, BoatSeeks): ...
 
 
 class RL625FlyerOnePercent(OnePercent, FlyerSeeks): ...
-
-
-class RL625CartOnePercent(OnePercent, CartSeeks): ...
-
-
-class RL625PuckOnePercent(OnePercent, PuckSeeks): ...
 
 
 class RL706BulletArmOnePercent(Arm):

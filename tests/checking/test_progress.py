@@ -16,7 +16,6 @@ CASES = [
     broken("RL622BoatGoesAway", "BoatSeeks", pybullet=True),
     broken("RL622FlyerGoesAway", "FlyerSeeks"),
     broken("RL622CartGoesAway", "CartSeeks"),
-    broken("RL622HopperGoesAway", "HopperSeeks"),
     broken("RL622PuckGoesAway", "PuckSeeks", pybullet=True),
     broken("RL622ArmCostsSuccess", "ArmPaysSuccess"),
     broken("RL622FlyerCostsSuccess", "FlyerPaysSuccess"),
@@ -25,7 +24,6 @@ CASES = [
     broken("RL125CartTurnsBack", "CartSeeks"),
     broken("RL125FlyerTurnsBack", "FlyerSeeks"),
     broken("RL125HopperTurnsBack", "HopperSeeks"),
-    broken("RL125CrawlerTurnsBack", "CrawlerSeeks", pybullet=True),
     broken("RL125PuckTurnsBack", "PuckSeeks", pybullet=True),
 ]
 

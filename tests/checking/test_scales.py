@@ -19,8 +19,6 @@ CASES = [
     broken("RL625RL706ReacherOnePercent", REACHER, "RL625", "RL706", pybullet=True, slow=True),
     broken("RL625BoatOnePercent", "broken_progress.py:BoatSeeks", "RL625", pybullet=True, slow=True),
     broken("RL625FlyerOnePercent", "broken_progress.py:FlyerSeeks", "RL625", pybullet=True, slow=True),
-    broken("RL625CartOnePercent", "broken_progress.py:CartSeeks", "RL625", pybullet=True, slow=True),
-    broken("RL625PuckOnePercent", "broken_progress.py:PuckSeeks", "RL625", pybullet=True, slow=True),
     broken("RL706ArmOnePercent", "mujoco_robots.py:MujocoArm", "RL706"),
     broken("RL706HopperOnePercent", "mujoco_robots.py:MujocoHopper", "RL706", slow=True),
     broken("RL706BulletArmOnePercent", "robots.py:Arm", "RL706", pybullet=True),
