@@ -21,7 +21,9 @@ from rlctl.processes import child_process
 from tests import fork_server
 
 gc.disable()  # until all is collected: what is imported and collected stays
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup what is started here would ignore it
+# Under nohup, or in the background of a script, what is started here would ignore these.
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
 ALL_CORES = sorted(os.sched_getaffinity(0))
 if name := os.environ.get("PYTEST_XDIST_WORKER"):  # so what it trains and evaluates has one worker and not one per core
     os.sched_setaffinity(0, {ALL_CORES[int(name.removeprefix("gw")) % len(ALL_CORES)]})

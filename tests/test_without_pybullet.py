@@ -26,13 +26,20 @@ def rlctl_without(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_task_with_a_model_of_pybullet_names_what_is_missing(rlctl_without):
-    done = rlctl_without("train", "kuka-grasp", "-n", "100")
+    task = "tests.task.tasks:Stadium"
+    done = rlctl_without("train", task, "-n", "100")
     assert done.returncode == 3
-    model = "kuka_iiwa/kuka_with_gripper2.sdf"
     last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"error: task 'kuka-grasp': model file '{model}' not found")
+    assert last.startswith(f"error: task '{task}': model file 'plane_stadium.sdf' not found")
     assert "If it is one of PyBullet's: pip install " in last
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_kuka_grasp_needs_no_pybullet(rlctl_without):
+    done = rlctl_without("eval", "kuka-grasp", "--pretrained", "--episodes", "4", "--min-success", "0.75")
+    assert done.returncode == 0, done.stderr
+    assert "warning" not in done.stderr
 
 
 @pytest.mark.slow

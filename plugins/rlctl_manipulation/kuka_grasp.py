@@ -6,16 +6,21 @@ control steps of their own here: the policy sees them, but only the descent is s
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from rlctl.task import Box, Event, Sim, Task, TaskError, events, rewards
 
+MODELS = Path(__file__).with_name("models")
 # Seven joints of the arm, then the gripper's: turn, left finger, left tip, right finger, right tip. [rad]
 START = [0.0064, 0.4132, -0.0114, -1.5893, 0.0054, 1.1377, -0.0065, 0.0, -0.3, 0.0, 0.3, 0.0]
 ARM = [f"J{number}" for number in range(7)]
 WRIST = ["gripper_to_arm"]
 FINGERS = ["base_left_finger_joint", "left_base_tip_joint", "base_right_finger_joint", "right_base_tip_joint"]
+# [N m], those of the file. The original's 200 are too few in MuJoCo, whose motors overshoot at their limit: with an
+# outstretched arm a descent takes 190 to 210.
+ARM_FORCE = [300.0] * 7
 FINGER_FORCE = [2.0, 2.0, 2.5, 2.0]  # [N m], as the original has them
 TIPS = {"left_finger_tip", "right_finger_tip"}
 HAND = "lbr_iiwa_link_7"
@@ -32,8 +37,9 @@ TURN = 0.05  # [rad], of the gripper at action 1
 DESCENT, LIFT = 0.002, 0.004  # [m], per control step; the original lifts 1 mm in each of its steps of 1/240 s
 OPEN = 0.3  # [rad], of each finger
 CLOSING_STEPS = 25
-NEAR_TRAY = 0.08  # [m], height of the gripper
-GRASP_GAP = 0.005  # [m], between gripper and tray, at which the descent ends
+# Height of the gripper at which the descent ends [m]. Open fingers are 14 mm above the tray's floor then, and swing
+# 12 mm lower when they close. The original measures the distance to the tray: there a wall near a finger counts too.
+GRASP_HEIGHT = 0.055
 TOP = 0.5  # [m], where the lift of the hand ends
 BLOCK_REST = -0.175  # [m], height of the block's middle in the tray
 ALIGNED = 0.02  # [m]; so far from the block's middle, alignment is worth 1/e
@@ -96,12 +102,10 @@ class KukaGrasp(Task):
                     f"{high:g}, the lower value first."
                 )
         sim.set_gravity(10.0)
-        self.arm = sim.load("arm", "kuka_iiwa/kuka_with_gripper2.sdf")
-        self.arm.set_base(BASE)
+        self.arm = sim.load("arm", MODELS / "kuka_gripper.urdf", position=BASE, fixed=True)
         self.arm.cap_joint_speed(10.0)  # [rad/s]
-        self.tray = sim.load("tray", "tray/tray.urdf", position=TRAY, orientation=(0, 0, 1, 0), fixed=True)
-        # The file's inertia is that of a body of tons; see `rlctl tasks show`.
-        self.block = sim.load("block", "block.urdf", inertia="shape")
+        self.tray = sim.load("tray", MODELS / "tray.urdf", position=TRAY, orientation=(0, 0, 1, 0), fixed=True)
+        self.block = sim.load("block", MODELS / "long_block.urdf")
         self.all_joints = np.array(START)
         self.finger_joints = self.arm.find_joints(FINGERS)
         self.arm.set_joints(self.all_joints)
@@ -122,8 +126,7 @@ class KukaGrasp(Task):
         """Move the hand by the action and down; once it is at the tray, close the gripper, then lift."""
         self.steps += 1
         self.action_change, self.last_action = action - self.last_action, action
-        if self.descending and self.gripper[2] < NEAR_TRAY:  # the exact distance takes 0.1 ms
-            self.descending = self.arm.distance_to(self.tray) > GRASP_GAP
+        self.descending = self.descending and self.gripper[2] > GRASP_HEIGHT
         if self.descending:
             self.target[:2] = np.clip(self.target[:2] + STEP * action[:2], HAND_LOW, HAND_HIGH)
             self.target[2] -= DESCENT
@@ -133,7 +136,7 @@ class KukaGrasp(Task):
         else:
             self.target[2] = min(self.target[2] + LIFT, TOP)
         joints = self.arm.solve_inverse_kinematics(HAND, self.target, DOWN)[:7]
-        self.arm.drive_to(joints, max_speed=[10.0] * 7, max_force=[200.0] * 7, gain=0.3, joints=ARM)
+        self.arm.drive_to(joints, max_speed=[10.0] * 7, max_force=ARM_FORCE, gain=0.3, joints=ARM)
         self.arm.drive_to(np.array([self.turn]), max_speed=[10.0], max_force=[200.0], joints=WRIST)
         fingers = np.array([-self.opening, 0.0, self.opening, 0.0])
         self.arm.drive_to(fingers, max_speed=[10.0] * 4, max_force=FINGER_FORCE, joints=FINGERS)

@@ -30,7 +30,7 @@ _SHARE_OF_STEPS = 4  # a student takes a quarter of the steps of a training
 _EPISODE_SEED = 0  # of `rlctl eval` too, whose result is therefore the same
 _BY_CAMERA = {
     "n_envs": 32,
-    "total_timesteps": 80_000,
+    "total_timesteps": 40_960,
     "eval": {"every_steps": 20_000},
     "algo_kwargs": {"n_steps": 32, "batch_size": 128, "n_epochs": 16},
     "policy_kwargs": {"net_arch": [256, 256]},

@@ -14,7 +14,7 @@ def broken(name, twin, **settings):
 
 CASES = [
     broken("RL824HopperShakes", "HopperDamps", slow=True),
-    broken("RL824LeverRepels", "Lever"),
+    broken("RL824LeverRepels", "Lever", slow=True),
     broken("RL824HopperRepels", "HopperDamps"),
     broken("RL824ArmRepels", "ArmDamps"),
     broken("RL824CartRepels", "CartKeepsSpeed"),

@@ -20,7 +20,7 @@ def measures(robot, **settings):
 CART, BELT = "broken_integration.py:RL823CartIsPushed", "broken_integration.py:RL823PusherWithABelt"
 CASES = [
     broken("RL823FlyerTwice", "broken_turned.py:Flyer", slow=True),
-    broken("RL823CartTwice", CART),
+    broken("RL823CartTwice", CART, slow=True),
     broken("RL823ArmTwice", "mujoco_robots.py:MujocoArm"),
     broken("RL823HopperTwice", "mujoco_robots.py:MujocoHopper"),
     broken("RL823BulletArmTwice", "robots.py:Arm", pybullet=True),

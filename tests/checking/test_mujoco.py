@@ -29,7 +29,7 @@ CASES = [
     broken("RL807HopperInTheGround", "RL807", slow=True),
     broken("RL813ArmLongSteps", "RL813", slow=True),
     broken("RL814ArmWeakMotors", "RL814", slow=True),
-    broken("RL810ArmDegrees", "RL810", "error"),
+    broken("RL810ArmDegrees", "RL810", "error", slow=True),
     broken("RL810ArmRangeInDegrees", "RL810", "error", "ArmRange", slow=True),
     broken("RL810ArmRangeOfActuatorInDegrees", "RL810", slow=True),
     broken("RL810ArmObservesRadiansOfRadians", "RL810", "error", slow=True),

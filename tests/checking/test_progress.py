@@ -21,7 +21,7 @@ CASES = [
     broken("RL622FlyerCostsSuccess", "FlyerPaysSuccess"),
     broken("RL622CartCostsSuccess", "CartPaysSuccess"),
     broken("RL622PuckCostsSuccess", "PuckPaysSuccess", pybullet=True),
-    broken("RL125CartTurnsBack", "CartSeeks"),
+    broken("RL125CartTurnsBack", "CartSeeks", slow=True),
     broken("RL125FlyerTurnsBack", "FlyerSeeks"),
     broken("RL125HopperTurnsBack", "HopperSeeks"),
     broken("RL125PuckTurnsBack", "PuckSeeks", pybullet=True),

@@ -150,6 +150,7 @@ def test_numbers_become_actions_of_every_kind():
         assert tuple(part.tolist() for part in action["more"]) == more
 
 
+@pytest.mark.slow
 def test_the_term_that_makes_a_reward_large_is_named():
     (finding,) = findings(f"{BROKEN}:RL603LargeTerm", "RL603")
     assert finding.evidence["term"] == "distance"

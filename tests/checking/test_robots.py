@@ -21,11 +21,11 @@ CASES = [
     case(
         "broken_robots.py:RL116CrawlerQuaternion", ("RL116", "error"), ("RL117", "info"), twin="robots.py:Crawler"
     ),  # at pi
-    broken("RL118BoatMillimetres", "RL118", "info", "Boat"),
+    broken("RL118BoatMillimetres", "RL118", "info", "Boat", slow=True),
     broken("RL118CrawlerDegrees", "RL118", "info", "Crawler"),
     broken("RL310BoatStaysAtBuoy", "RL310", "error", "RL310BoatArrives", slow=True),
     broken("RL310TankCountsOn", "RL310", "error", "RL310TankCountsAnew"),
-    broken("RL311BoatGusts", "RL311", "error", "RL311BoatSeededGusts"),
+    broken("RL311BoatGusts", "RL311", "error", "RL311BoatSeededGusts", slow=True),
     broken("RL311TankSpills", "RL311", "error", "RL311TankSeededSpills"),
     broken("RL507TankFailsAsTruncated", "RL507", "warning", "Tank"),
     broken("RL507CrawlerFallsAsTruncated", "RL507", "warning", "RL507CrawlerFalls"),
@@ -37,12 +37,12 @@ CASES = [
     broken("RL616ArmLateReward", "RL616", "warning", "Arm", slow=True),
     broken("RL704BoatNan", "RL704", "info", "Boat"),
     broken("RL704TankNan", "RL704", "info", "Tank"),
-    broken("RL803PusherInsideItsCube", "RL803", "warning", "Pusher"),
+    broken("RL803PusherInsideItsCube", "RL803", "warning", "Pusher", slow=True),
     broken("RL810ArmDegrees", "RL810", "error", "Arm"),
     broken("RL810CrawlerStartsInDegrees", "RL810", "error", "Crawler"),
     broken("RL811ArmOrder", "RL811", "error", "Arm"),
     broken("RL811CrawlerOrder", "RL811", "error", "Crawler"),
-    broken("RL812ArmTouchesNothing", "RL812", "warning", "RL812ArmTouches"),
+    broken("RL812ArmTouchesNothing", "RL812", "warning", "RL812ArmTouches", slow=True),
     broken("RL812CrawlerOtherFloor", "RL812", "warning", "RL812CrawlerFloor"),
     broken("RL813ArmLongPhysicsSteps", "RL813", "warning", "Arm"),
     broken("RL814ArmWeakMotors", "RL814", "warning", "Arm"),

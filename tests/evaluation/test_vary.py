@@ -325,11 +325,12 @@ def test_the_worst_contacts_are_gated(rlctl):
 
 
 @pytest.mark.pybullet
-def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl):
+def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl, tmp_path):
     pytest.importorskip("mujoco")
-    done = rlctl("eval", "kuka-grasp", "--pretrained", "--sim", "mujoco")
+    run = write_run(tmp_path / "run", "tests.task.tasks:Stadium")
+    done = rlctl("eval", run.path, "--sim", "mujoco")
     assert done.returncode == 3
-    assert done.stderr.endswith("kuka_with_gripper2.sdf: MuJoCo reads URDF and MJCF (.xml) files\n")
+    assert done.stderr.endswith("plane_stadium.sdf: MuJoCo reads URDF and MJCF (.xml) files\n")
 
 
 @pytest.mark.slow

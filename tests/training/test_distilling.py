@@ -162,7 +162,7 @@ def test_a_student_sees_by_a_camera(run, seen_stool, tmp_path):
 def test_a_student_by_camera_takes_few_steps_and_learns_often():
     teacher = EnvSpec("tests.task.batches:SeenStool", sim=MUJOCO)
     settings = make_settings(DistillRequest(observe="front,hips", settings={"n_envs": 8}), teacher)
-    assert (settings["n_envs"], settings["total_timesteps"]) == (8, 80_000)
+    assert (settings["n_envs"], settings["total_timesteps"]) == (8, 40_960)
     assert settings["algo_kwargs"]["n_epochs"] == 16
     assert "n_envs" not in make_settings(DistillRequest(observe="hips"), teacher)
 

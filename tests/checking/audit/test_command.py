@@ -43,6 +43,7 @@ def test_a_plain_environment_has_a_ranking_alone(rlctl):
     assert "trembling" in done.stdout
 
 
+@pytest.mark.slow
 def test_options_of_rules_are_refused(rlctl):
     done = rlctl("check-env", "reach", "--audit", "--select", "RL6")
     assert done.returncode == 2

@@ -23,7 +23,8 @@ def list_changes(joints, **values):
     content = {"default_positions": positions, "observations": parts, "control_dt": 0.02, "start_height": 0.5}
     deployment = Deployment(joints=joints, commands=ranges, **gains, **{**content, **values})
     own = tuple(joints)
-    robot = Robot(Path("robot.xml"), joints=own, motors=(), breadth_first=own, limits={}, has_armature=True)
+    named = {"joints": own, "motors": (), "breadth_first": own, "links": ("trunk",)}
+    robot = Robot(Path("robot.xml"), limits={}, ranges={}, has_armature=True, **named)
     return {
         (variant.kind, variant.text): variant.list_changes(deployment) for variant in list_variants(deployment, robot)
     }

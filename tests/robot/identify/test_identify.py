@@ -219,6 +219,7 @@ def test_columns_that_are_not_used_may_hold_anything(real, tmp_path):
     np.testing.assert_array_equal(read_log(path, EXPECTED).actions, read_log(real, EXPECTED).actions)
 
 
+@pytest.mark.slow
 def test_command_line(rlctl, real, tmp_path):
     (tmp_path / "bad.csv").write_text("time\n0\n")
     done = rlctl("identify", ARM, "--log", "bad.csv")
@@ -231,6 +232,7 @@ def test_command_line(rlctl, real, tmp_path):
     assert (tmp_path / "out.csv").read_text().startswith("time,action_shoulder,action_elbow,position_shoulder")
 
 
+@pytest.mark.slow
 def test_the_peaks_of_quick_torques_are_not_smoothed():
     actions = np.sign(np.sin(1.3 * np.arange(100)))[:, None] * [1.0, -1.0]
     env = open_world(SPEC)
