@@ -267,12 +267,14 @@ class GoalEpisode:
 
     def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
         """Take a step for each goal; less if the episode ends."""
-        steps: list[GoalStep] = []
+        return list(self.follow(goals))
+
+    def follow(self, goals: Iterable[Numbers | None]) -> Iterator[GoalStep]:
+        """Take these steps one by one, for who looks at the episode after each."""
         for goal in goals:
             if self.has_ended:
                 break
-            steps.append(self.step(goal))
-        return steps
+            yield self.step(goal)
 
 
 def _read_success(moment: Moment) -> bool | None:

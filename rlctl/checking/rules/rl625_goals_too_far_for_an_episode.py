@@ -1,5 +1,6 @@
 """RL625: goals too far for an episode."""
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -83,10 +84,7 @@ def _trace(trials: GoalTrials, source: Source, seed: int, actions: str, most_ste
     if source[1] == TURNED:
         return _trace_turned(trials, source, seed, actions, most_steps)
     episode = GoalEpisode(trials, seed, actions)
-    places: list[Numbers] = []
-    while not episode.has_ended and len(places) < most_steps:
-        episode.step()
-        places.append(episode.read(source))
+    places = [episode.read(source) for _ in episode.follow(itertools.repeat(None, most_steps))]
     if episode.has_succeeded:
         places = []
     return np.array(places), episode.has_ended
@@ -100,15 +98,13 @@ def _trace_turned(trials: GoalTrials, source: Source, seed: int, actions: str, m
     squares = []
     for anchor in anchors:
         episode = GoalEpisode(trials, seed, actions)
-        distances: list[float] = []
-        while not episode.has_ended and len(distances) < most_steps:
-            episode.step(anchor)
-            distances.append(episode.measure_distance(source))
+        steps = episode.follow(itertools.repeat(anchor, most_steps))
+        distances = [episode.measure_distance(source) for _ in steps]
         if episode.has_succeeded:
             return np.zeros((0, size)), True
         squares.append(np.square(distances))
-    steps = min(map(len, squares))
-    differences = np.stack([square[:steps] - squares[-1][:steps] for square in squares[:-1]], axis=1)
+    shortest = min(map(len, squares))
+    differences = np.stack([square[:shortest] - squares[-1][:shortest] for square in squares[:-1]], axis=1)
     constants = np.square(anchors[:-1]).sum(axis=1) - np.square(anchors[-1]).sum()
     places = np.linalg.solve(2 * (anchors[:-1] - anchors[-1]), (constants - differences).T).T
     return places, episode.has_ended
