@@ -43,7 +43,7 @@ class GateRequest:
         if self.gates == NO_GATES and self.against is None:
             raise UsageError(
                 "gate: say what the policy must reach, e.g. --min-success-lower 0.9, or --min-return 100; "
-                "or with --against FILE which policy it must not be worse than"
+                "or which policy it must not be worse than: --against FILE"
             )
         if self.margin is not None and self.against is None:
             raise UsageError("--margin: with what is it compared? Add --against FILE.safetensors")
