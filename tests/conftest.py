@@ -5,6 +5,7 @@ import os
 # Each of the processes that run the tests has a core: threads of a library would only wait for each other.
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
+import collections
 import contextlib
 import gc
 import importlib.util
@@ -39,9 +40,11 @@ def pytest_collection_modifyitems(config, items):
 
 
 def _mark_slow_rows(items, is_complete):
-    """Mark as slow all rows of a parametrised test but those that its `slow_except` names, which must exist."""
+    """Mark as slow all rows of a parametrised test but those that its `slow_except` names, which must exist, or but the
+    first ones: `slow_except(first=2)`."""
     missing = set()
     found = set()
+    quick = collections.Counter()
     for item in items:
         marker = item.get_closest_marker("slow_except")
         if marker is None:
@@ -49,8 +52,11 @@ def _mark_slow_rows(items, is_complete):
         function, _, row = item.nodeid.removesuffix("]").partition("[")
         missing.update((function, name) for name in marker.args)
         found.add((function, row))
-        if row not in marker.args:
+        is_first = quick[function] < marker.kwargs.get("first", 0)
+        if row not in marker.args and not is_first:
             item.add_marker(pytest.mark.slow)
+        elif item.get_closest_marker("slow") is None:
+            quick[function] += 1
     missing -= found
     if missing and is_complete:
         raise pytest.UsageError(f"slow_except names rows that do not exist: {sorted(missing)}")

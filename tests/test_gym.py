@@ -5,6 +5,7 @@ import sys
 
 import gymnasium
 import numpy as np
+import pytest
 
 
 def test_make_by_id():
@@ -59,6 +60,7 @@ def test_a_vector_of_them():
     envs.close()
 
 
+@pytest.mark.slow
 def test_registering_imports_no_plugin():
     code = (
         "import sys, rlctl.gym; print(sorted(m for m in sys.modules if m.startswith(('rlctl_', 'pybullet', 'torch'))))"

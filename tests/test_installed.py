@@ -145,6 +145,7 @@ def test_a_broken_plugin_harms_only_itself(rlctl, importable, tmp_path):
     ], result.stderr
 
 
+@pytest.mark.slow
 def test_metadata_that_is_half_there(rlctl, install):
     site = install("half", {"half": "half_there:Task"})
     (site / "half-1.2.dist-info" / "METADATA").unlink()
@@ -152,6 +153,7 @@ def test_metadata_that_is_half_there(rlctl, install):
     assert tasks["half", "?"]["version"] == "?"
 
 
+@pytest.mark.slow
 def test_a_checkout_beside_its_installation_is_one(rlctl, install, tmp_path):
     site = install("twice", {"twice": "twice_there:Task"}, {"twice_there.py": ""})
     install("twice", {"twice": "twice_there:Task"}, version="1.3")

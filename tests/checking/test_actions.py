@@ -65,6 +65,7 @@ def test_a_first_episode_unlike_the_others_hides_nothing():
     assert the_finding("DeadLater", "RL701").evidence["value"] == ["action[1]"]
 
 
+@pytest.mark.slow
 def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
     finding = the_finding("Watched", "RL701")
     assert finding.message.startswith("no element of the action changes anything but its own step's reward")

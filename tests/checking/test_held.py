@@ -30,6 +30,7 @@ def test_time_passes_while_a_robot_is_held():
     assert [(episode.ended, len(episode.rewards)) for episode in held] == [("truncated", 150)] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_first_late_command_is_placed():
     (finding,) = findings(f"{HELD}:RL122CrawlerSeesLate", "RL122")

@@ -118,6 +118,7 @@ def test_flags_per_agent_are_of_a_wrong_type_and_end_nothing():
     assert [finding.rule for finding in verdict.findings] == ["RL204", "RL204"]
 
 
+@pytest.mark.slow
 def test_an_exception_in_a_library_is_placed_at_its_call(tmp_path, monkeypatch):
     (tmp_path / "site-packages").mkdir()
     (tmp_path / "site-packages" / "grippers.py").write_text("def close():\n    raise ValueError('no gripper')\n")
@@ -132,6 +133,7 @@ def test_an_exception_in_a_library_is_placed_at_its_call(tmp_path, monkeypatch):
     assert finding.message == "reset raised ValueError: no gripper (gripping.py:9)"
 
 
+@pytest.mark.slow
 def test_missing_opengl_is_fixed_by_another_backend_and_other_exceptions_by_repair():
     (finding,) = findings(f"{FILE}:LacksOpenGL", "RL207")
     assert "set MUJOCO_GL=egl (or osmesa)" in finding.fix

@@ -70,6 +70,7 @@ def test_goals_without_a_seed_are_not_judged():
         shared_records_of(f"{REACH}:ArmByChance", "goals").require_fact("goals")
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("name", "elements"),
     [("PlanarArm", (0, 1)), ("UprightArm", (0, 2)), ("PlanarArmSeesAll", (0, 1, 2)), ("PosedArm", (0, 1))],
@@ -102,6 +103,7 @@ def test_goals_that_are_reached_at_once_are_none_to_come_nearer_to():
     assert verdict.not_applicable == {"RL623": "episodes are too short, or begin with a success"}
 
 
+@pytest.mark.slow
 def test_what_the_joints_do_not_move_is_not_the_hand():
     goals = shared_records_of(f"{REACH}:ArmUnclearReward", "goals").require_fact("goals")
     (reach,) = goals.reaches.values()  # where the goal itself is observed, its difference to itself is the base

@@ -138,6 +138,7 @@ def test_a_joint_without_effort_limit_is_named():
     assert "pass max_force= [N m]" in finding.message
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_impossible_inertia_is_named():
     (finding,) = findings("broken_models.py:RL809HeavyInertia", "RL809")

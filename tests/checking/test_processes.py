@@ -76,6 +76,7 @@ def test_segfault_is_a_finding(in_root):
     assert {"RL301", "RL401", "RL501"} <= report.verdict.not_judged.keys()
 
 
+@pytest.mark.slow
 def test_hang_is_a_finding_after_the_timeout(in_root):
     report = check(
         EnvSpec(f"{BROKEN}:RL209Hangs"), env_timeout_s=0.7

@@ -87,6 +87,7 @@ def test_worth_is_discounted():
     assert discounted_steps(-1.0, 3) == pytest.approx(-2.9701)
 
 
+@pytest.mark.slow
 def test_falling_is_compared_with_going_on():
     evidence = finding_of("RL604Falls").evidence
     mean, last, steps = evidence["mean_reward"], evidence["value"], evidence["step"]
@@ -117,6 +118,7 @@ def test_hovering_is_found_and_placed():
     assert f" from step {finding.evidence['step']} on; " in finding.message
 
 
+@pytest.mark.slow
 def test_doing_nothing_earns_the_bonus():
     evidence = finding_of("RL606AliveBonus").evidence
     # 50 steps of 1: (1 - 0.99^50) / 0.01 = 39.4994
@@ -124,6 +126,7 @@ def test_doing_nothing_earns_the_bonus():
     assert (evidence["term"], evidence["share"]) == ("alive", 1.0)
 
 
+@pytest.mark.slow
 def test_constant_penalty_is_named():
     evidence = finding_of("RL612WrongSlice").evidence
     # -0.05 * 5

@@ -76,6 +76,7 @@ def test_a_task_that_randomises_is_judged_so(rlctl):
     assert "not judged: RL301: the episode failed (RL201, RL207)" in done.stdout
 
 
+@pytest.mark.slow
 def test_an_error_of_the_task_layer_is_named_as_one():
     (finding,) = findings("broken_variants.py:NotFinite", "RL207")
     assert finding.message == "step 1 raised TaskError: NotFinite: reward term 'distance' is nan at step 1"

@@ -9,6 +9,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 VALUE = "1"  # instead of what is filled in: it can be a name, a path and a number
 PHRASE = re.compile(r"\brlctl [a-z](?:[^\n`;,)\"<.:]|[.:](?! ))*")
+NAMED = re.compile(r"\brlctl\b(?!\.| import)")
+"""Where code names the program, and not a module: files without it need not be parsed."""
 FILLED_IN = re.compile(r"\{[^{}\n]*\}|\$\w+")  # in templates
 PROSE = {"are", "cannot", "does", "error", "finds", "have", "installed", "itself", "makes", "policy"}
 PROSE |= {"repeated", "counts", "changed", "loads", "raise", "reads", "seeds", "takes", "uses", "with", "wrote"}
@@ -39,6 +41,8 @@ def find_all() -> list[Printed]:
         if file.suffix not in (".py", ".yaml", ".html", ".tmpl"):
             continue
         content = file.read_text(encoding="utf-8")
+        if not NAMED.search(content):
+            continue
         texts = _find_in_code(content) if file.suffix == ".py" else _find_in_lines(content)
         for line, text in texts:
             for match in PHRASE.finditer(text):

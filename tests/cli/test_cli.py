@@ -70,6 +70,7 @@ def test_version(installed_rlctl):
     assert (result.returncode, result.stdout, result.stderr) == (0, f"rlctl {package.__version__}\n", "")
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("arguments", [["-h"], ["--help"], ["train", "-h"], ["eval", "--help"]])
 def test_help(rlctl, arguments):
     result = rlctl(*arguments)
@@ -219,6 +220,7 @@ def test_an_environment_that_fails_in_an_evaluation(rlctl, printing, policy):
     assert result.stdout == ""
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("arguments", [["tasks"], ["tasks", "--json", "-"], ["--help"], ["--version"]])
 def test_a_closed_stdout_ends_quietly(rlctl, arguments):
     read_end, write_end = os.pipe()
@@ -257,6 +259,7 @@ def test_piped_output_is_plain(rlctl):
     assert "\x1b" not in rlctl("tasks", env={"NO_COLOR": ""}).stdout
 
 
+@pytest.mark.slow
 def test_ctrl_c(tmp_path, write_module):
     write_module("slow.py", "import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from rlctl.cli import main; main()"

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from rlctl.arguments import complete_algorithm, complete_run, complete_task
 
 
@@ -32,6 +34,7 @@ def test_runs(tmp_path, monkeypatch):
     assert complete_run("runs/r") == [oldest]
 
 
+@pytest.mark.slow
 def test_the_shell_gets_them(tmp_path):
     words = {"_RLCTL_COMPLETE": "complete_bash", "COMP_WORDS": "rlctl train rea", "COMP_CWORD": "2"}
     done = subprocess.run(

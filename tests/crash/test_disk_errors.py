@@ -17,6 +17,7 @@ def errors(part, operations, each=3):
 
 
 # Takes seconds, and runs in every `make test`: a full disk leaves whole files.
+@pytest.mark.crash
 @parts(3)
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_error_once_costs_nothing(trials, whole, folders, name, part):

@@ -157,6 +157,7 @@ def test_files_of_one_name_in_many_folders(write_module):
         assert [sys.modules[cls.__module__].MyEnv for cls in classes] == classes
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("name", ["random", "types", "json", "turtle"])
 def test_a_file_named_like_a_standard_module(write_module, name):
     write_module(f"envs/{name}.py", ENV)
@@ -371,6 +372,7 @@ def test_make_randomises_when_it_is_asked_to(my_env):
         rlctl.make("my_env.py:MyEnv", randomize=True)
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("source", "message"),
     [

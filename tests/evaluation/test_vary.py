@@ -149,6 +149,7 @@ def test_the_command_for_one_cell_plays_it_and_leaves_the_measurement(vary, rlct
     assert run.robustness_file.read_bytes() == stored
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_command_leaves_out_what_the_policy_file_has(tmp_path):
     run = write_run(tmp_path / "run", f"{ENVS}:Block")
@@ -371,6 +372,7 @@ def test_the_nominal_setting_may_be_the_worst(measured):
         check_gates(turned, Gates(min_success=0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_function_of_the_user_has_maps_too(tmp_path, monkeypatch, rlctl):
     monkeypatch.chdir(tmp_path)

@@ -103,6 +103,7 @@ def test_c_acts_as_the_policy(algo, observation, action, settings, small, train,
     assert worst <= (1e-2 if action == "wide" else 1e-5)
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_hard_normalisation(small, train, write, compiled, odd_statistics):
     model = train("ppo", small(), steps=0)
@@ -221,6 +222,7 @@ def test_names_bounds_and_units_are_data(frames, small, train, write, tmp_path):
     assert read_numbers(library, "policy_action_high", 2) == [1.0, 3.0]
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_choices_are_data(small, train, write, tmp_path):
     spec = small("parts", "multidiscrete")

@@ -62,7 +62,7 @@ def action_for(algo):
     return "discrete" if algo == "dqn" else "box"
 
 
-@pytest.mark.slow_except("ppo", "dqn", "recurrent_ppo", "sac")
+@pytest.mark.slow_except("ppo", "recurrent_ppo")
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_algorithm_acts_as_in_sb3_with_hard_normalisation(algo, small, train, write, odd_statistics):
     spec = small(action=action_for(algo))
@@ -72,6 +72,7 @@ def test_every_algorithm_acts_as_in_sb3_with_hard_normalisation(algo, small, tra
     assert difference(model, write(model, algo, spec), observations) <= 2e-6
 
 
+@pytest.mark.slow_except("ppo-dict", "ppo-image", "dqn-image_first", "ppo-multibinary")
 @pytest.mark.parametrize(
     "observation", ["double", "image", "image_first", "discrete", "multidiscrete", "multibinary", "dict"]
 )
@@ -83,6 +84,7 @@ def test_every_kind_of_observation(observation, algo, small, train, write):
     assert difference(model, write(model, algo, spec), observations) <= 1e-5
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("algo", ["sac", "recurrent_ppo"])
 def test_dict_observations_with_images_in_other_algorithms(algo, small, train, write):
     spec = small("dict")
@@ -91,6 +93,7 @@ def test_dict_observations_with_images_in_other_algorithms(algo, small, train, w
     assert difference(model, write(model, algo, spec), observations) <= 1e-5
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize("action", ["matrix", "double", "wide", "multidiscrete", "multibinary"])
 def test_every_kind_of_action(action, small, train, write):
     spec = small(action=action)
@@ -106,6 +109,7 @@ def test_squashed_actions_of_other_shapes_and_types(action, small, train, write)
     assert difference(model, write(model, "sac", spec), random_observations(model.observation_space)) <= 1e-6
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_every_activation(name, small, train, write):
     spec = small()

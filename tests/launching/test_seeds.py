@@ -124,6 +124,7 @@ def test_a_group_that_is_being_trained_is_not_removed(group):
         plan_removal([str(group.path)], root=group.path.parent.parent)
 
 
+@pytest.mark.slow
 def test_a_changed_task_is_one_warning_for_all_seeds(group, capsys):
     runs = [group.find_run(seed) for seed in group.seeds]
     digests = [run.status()["source_sha256"] for run in runs]

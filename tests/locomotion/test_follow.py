@@ -38,6 +38,7 @@ def test_keyframes_are_at_rest_and_joined_smoothly():
     assert np.abs(np.diff(rows[:, 0]))[[0, 49]] == pytest.approx([0.0, 0.0], abs=1e-3)
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("name", TASKS)
 def test_starts_are_in_the_clip(name):
     target, cls, _ = TASKS[name]
@@ -58,6 +59,7 @@ def test_starts_are_in_the_clip(name):
         assert env.unwrapped.task.rows.tolist() == [0]
 
 
+@pytest.mark.slow
 def test_zero_actions_are_not_enough():
     with contextlib.closing(EnvSpec(TASKS["quadruped-bow"][0]).as_deployed().make()) as env:
         env.reset(seed=0)

@@ -24,6 +24,7 @@ def reset(script, level, seed):
     return script.task
 
 
+@pytest.mark.slow
 def test_a_script_succeeds_and_each_stage_is_worth_more_than_the_last(script):
     task, paid = script.task, []
 

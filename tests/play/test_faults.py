@@ -27,6 +27,7 @@ def play(workers, steps=4):
 PLACE = f"in environment 2, episode seed 7, step 3; to see it alone: rlctl check-env {ENVS}:Walk"
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     ("fault", "message"),
     [

@@ -64,6 +64,7 @@ def test_rebuilt_environments_answer(spec, start, goals):
     assert workers.compute_rewards(*goals).tolist() == (2.0 * before).tolist()
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("fault", "message"),
     [

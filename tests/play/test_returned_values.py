@@ -32,6 +32,7 @@ def failure(env, **parameters):
     return describe_failure(caught.value)
 
 
+@pytest.mark.slow_except(first=5)
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
@@ -64,6 +65,7 @@ def test_what_is_returned(fault, message):
     assert failure("Faulty", fault=fault) == WorkerException(f"ValueError: {message}", where=(0, 7, 7))
 
 
+@pytest.mark.slow_except(first=5)
 @pytest.mark.parametrize(
     ("fault", "message"),
     [

@@ -71,6 +71,7 @@ def test_each_has_a_process(start, name):
     assert "bullet_envs.py:" in workers.shared_world.how
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("name", ["Ball", "Wrapped"])
 def test_a_client_in_every_call_shares_a_process(start, name):
     workers = start(EnvSpec(f"{BALLS}:{name}"), 3, n_workers=1)
@@ -79,6 +80,7 @@ def test_a_client_in_every_call_shares_a_process(start, name):
     assert ([envs[0] for envs in workers.playable_envs], workers.shared_world) == ([0], None)
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(("source", "how"), [(BY_NAME, "by name"), (OF_THE_MODULE, "no PyBullet client of its own")])
 def test_calls_that_cannot_be_seen(start, write_module, source, how):
     workers = start(EnvSpec(f"{write_module('stands.py', source)}:Still"), 2, n_workers=1)

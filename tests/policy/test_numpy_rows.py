@@ -83,18 +83,7 @@ def take(observations, k):
     return {key: part[k] for key, part in observations.items()} if isinstance(observations, dict) else observations[k]
 
 
-@pytest.mark.slow_except(
-    "ppo-samples",
-    "ppo, dict-samples",
-    "ppo, gSDE-samples",
-    "ppo, categories-samples",
-    "sac-samples",
-    "sac, image-mean",
-    "td3-uniform",
-    "crossq-mean",
-    "dqn-samples",
-    "recurrent_ppo-samples",
-)
+@pytest.mark.slow_except("recurrent_ppo-samples", "ppo, dict-samples", "ppo, gSDE-samples")
 @pytest.mark.parametrize("exploration", EXPLORATIONS)
 @pytest.mark.parametrize("case", CASES)
 def test_the_bits_of_one_alone(policy, case, exploration):  # noqa: F811

@@ -106,6 +106,7 @@ sys.exit(error_boundary.run(lambda: {call}))
 """
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("call", "name"),
     [

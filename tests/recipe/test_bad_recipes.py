@@ -189,6 +189,7 @@ def test_parameters_of_a_task(setting, message, tmp_path):
     assert message in not_built("reach", tmp_path / "runs", ["n_envs=1", setting])
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -47,6 +47,7 @@ def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
     assert sources.resolve("reach", Path("presets/ppo"), {}).n_envs == 3
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("task", "cls", "preset", "count"),
     [("biped", Biped, "presets/biped-ladder", 4), ("gear-arm", GearArm, "presets/gear-arm-ladder", 4)],

@@ -96,6 +96,7 @@ def test_a_number_below_1_or_not_whole_is_refused(rlctl, value, problem):
     assert problem in done.stderr
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -177,6 +177,7 @@ def test_camera_follows_the_torso(recordings, name, torso):
     assert followed in entities(recordings[name][0])
 
 
+@pytest.mark.slow
 def test_camera_follows_no_arm(reached, tmp_path):
     write_rrd(tmp_path / "reach.rrd", reached, title="reach", warn=print)
     assert tracked(tmp_path / "reach.rrd") == []

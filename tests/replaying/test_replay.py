@@ -161,6 +161,7 @@ def test_what_an_environment_prints_stays_out_of_the_result(replay, tmp_path):
     assert done.stderr == "a plugin talks\n(10 times: a plugin talks)\n"
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -220,6 +221,7 @@ def test_environment_that_fails(replay, tmp_path):
     assert not (tmp_path / "x.rrd").exists()
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.pybullet
 @pytest.mark.parametrize(
     ("display", "reason"),

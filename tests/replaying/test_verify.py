@@ -38,6 +38,7 @@ def test_recorded_episode_is_the_same_again(replay, episode_file):
     assert list(episode_file.parent.glob("*.rrd")) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["Tumble", "Pixels"])
 def test_episodes_of_other_environments_are_the_same_again(name, tmp_path):
     rollout, _ = play(name)
@@ -145,6 +146,7 @@ def test_environment_that_is_not_reproducible(tmp_path):
     assert difference.steps == 5
 
 
+@pytest.mark.slow
 def test_other_versions_are_named(replay, tampered, episode):
     path = tampered(info={"versions": {**episode.info.versions, "numpy": "1.0", "gone": "3", "torch": "1.0"}})
     done = replay("--verify", path)

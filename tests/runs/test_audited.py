@@ -21,6 +21,7 @@ def test_a_run_that_hardly_succeeds_names_the_command(write_run, rlctl):
     assert "--audit" not in rlctl("runs", "show", good).stdout
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("text", ["{}", "[1", '{"format": "rlctl check-env audit 9"}'])
 def test_a_file_of_something_else_is_a_warning(write_run, rlctl, text):
     run = write_run("reach/a")

@@ -90,6 +90,7 @@ def test_recipes_are_compared_seed_by_seed(root):
     assert [len(side["runs"]) for side in (content["baseline"], *content["candidates"])] == [2, 2]
 
 
+@pytest.mark.slow
 def test_runs_of_several_recipes_as_one_are_pointed_out(root):
     result = compare([f"{root}/0.9*/Line/*_s0", f"{root}/0.9*/Line/*_s1"], EvalRequest(None, episodes=2))
     assert result.baseline.mixed == ["algo_kwargs.gamma"]
@@ -262,6 +263,7 @@ def test_a_parameter_that_is_not_set_has_its_default():
     assert find_difference(same, unset) == {}
 
 
+@pytest.mark.slow
 def test_a_report_of_two_recipes_begins_with_the_verdict(root):
     text = write_report([f"{root}/0.9*/Line/*"], "md", root / "report.md", episodes=2).read_text()
     assert "\n**gamma 0.99 against gamma 0.9: cannot tell**\n" in text

@@ -94,7 +94,7 @@ def test_a_status_that_is_nested_deeply(depth, write_run):
     assert summarize(folder).reason == "run.json: damaged: nested too deeply"
 
 
-@pytest.mark.slow_except("stages: {a: 1}")
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["algo: [ppo]", "algo_kwargs: 5", "stages: {a: 1}", "algo: {ppo: 1}"])
 def test_a_recipe_of_other_types_is_not_diagnosed(recipe, write_run, capsys):
     folder = write_run("reach/2026-11-21_10-00-00_s0", metrics=[(step, 0.5, 1.0) for step in range(12)])

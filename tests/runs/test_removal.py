@@ -81,6 +81,7 @@ def test_refuses_what_is_not_a_run(write_run, tmp_path):
             plan_removal(nothing)
 
 
+@pytest.mark.slow
 def test_asks_only_on_a_terminal(write_run, rlctl):
     run = write_run("reach/2026-01-01_00-00-00_s0")
     refused = rlctl("runs", "rm", run, stdin=-3)

@@ -204,6 +204,7 @@ def test_curves_name_the_folders_that_the_user_named(write_run):
     assert "dots: evaluations" in picture  # three evaluations are no curve
 
 
+@pytest.mark.slow
 def test_labels_of_the_user(write_run):
     texts = write_two_recipes(write_run)
     picture = write(*texts, form="svg", target=Path("curves.svg"), labels=["ours", "theirs"])
@@ -454,11 +455,7 @@ def test_maps_of_a_policy_are_a_picture():
         plots.choose_form(Path("map.jpg"))
 
 
-@pytest.mark.slow_except(
-    "arguments0---vary compares two policies, the baseline first",
-    "arguments1---vary draws a map and judges nothing",
-    "arguments2---picture draws maps: add --vary",
-)
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

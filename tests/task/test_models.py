@@ -68,6 +68,7 @@ def test_a_file_that_is_missing_in_a_folder_names_the_closest_ones(tmp_path):
         find_model_file(tmp_path / "nowhere" / "arm.urdf")
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.pybullet
 @pytest.mark.parametrize("model", THEIRS)
 def test_numbers_are_those_of_the_model_in_pybullet_data(sim, model):

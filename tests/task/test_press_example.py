@@ -37,6 +37,7 @@ def test_what_the_sensors_say(env):
     assert info["is_success"]
 
 
+@pytest.mark.slow
 def test_a_camera_of_ten_pictures_a_second(env):
     rows, _, _ = press(env, 0)
     pictures = [row["camera"] for row in rows]

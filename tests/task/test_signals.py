@@ -124,6 +124,7 @@ def test_a_delay_widens_in_whole_steps(make):
         assert drawn == expected
 
 
+@pytest.mark.slow
 def test_noise_is_as_large_as_was_drawn(make):
     env = make(Clock(), noisy_angle={})
     for seed in range(3):

@@ -191,6 +191,7 @@ def test_an_arm_that_does_not_reach_the_table(tmp_path, monkeypatch):
         new.create("my-arm", model="arm.xml", hand=["pick"])
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

@@ -43,6 +43,7 @@ def arm(tmp_path):
     return write_arm(tmp_path, FOUR_BARS, equality=LOOPS)
 
 
+@pytest.mark.slow
 def test_a_finger_of_a_linkage_stays_upright(arm):
     linkage, surfaces = load(arm)
     gripper = GripperSearch(linkage, surfaces).find(None)

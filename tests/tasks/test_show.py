@@ -182,6 +182,7 @@ def test_a_plain_environment(rlctl, write_module):
     assert "missing 1 required positional argument: 'size'" in result.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("task", "code", "message"),
     [

@@ -201,6 +201,7 @@ def name_a_dog(folder: Path, name: str, *, free: bool) -> Path:
 PLACES = [(x, y) for x in (0.15, -0.15) for y in (0.08, -0.08)]
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("walk", [False, True])
 @pytest.mark.parametrize("name", ['x");open("PWNED","w");("b', 'a\'"""\n\U0001f916'])
 def test_a_plugin_of_a_file_with_hostile_names(tmp_path, monkeypatch, name, walk):

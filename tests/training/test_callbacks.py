@@ -62,6 +62,7 @@ def test_what_is_no_callback_is_not_called(train, tmp_path, name):
     assert not (tmp_path / "called").exists()
 
 
+@pytest.mark.slow
 def test_a_downloaded_run_imports_no_callback(train, resume, monkeypatch):
     run = train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Adaptive": {}}}).run
     monkeypatch.setattr("rlctl.hub.store._cache", lambda: run.path.parent)
@@ -229,6 +230,7 @@ def test_resume_is_exact_with_a_callback_of_stable_baselines3(train, resume, kil
     assert_same_run(whole, run_of())
 
 
+@pytest.mark.slow
 def test_a_schedule_that_sb3_callbacks_replace_is_reported(train, capsys):
     train("Line", {**SMALL_PPO, "callbacks": {f"{SB3}:NewSchedule": None}})
     assert "NewSchedule: its model.lr_schedule is a function, which a checkpoint does not" in capsys.readouterr().err

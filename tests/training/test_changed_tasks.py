@@ -236,6 +236,7 @@ def test_an_import_changes_nothing_of_ours(train, intrusive):
     assert_same_run(whole, run)
 
 
+@pytest.mark.slow
 def test_an_import_does_not_take_signals_from_a_training(train, intrusive, monkeypatch):
     from rlctl.training.checkpoints import Checkpoints
 
@@ -254,6 +255,7 @@ def test_an_import_does_not_take_signals_from_a_training(train, intrusive, monke
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+@pytest.mark.slow
 def test_a_task_that_cannot_be_imported_any_more(plugin, resume):
     folder, run = plugin
     change(folder, "class Mine", "raise SystemExit(0)\nclass Mine")

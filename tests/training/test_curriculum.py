@@ -199,6 +199,7 @@ def test_an_off_policy_algorithm_keeps_its_replay_buffer(train):
     assert {stage for step, stage in zip(steps, stage, strict=True) if step > 48} == {2}
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("second", "message"),
     [

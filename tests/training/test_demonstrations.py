@@ -235,6 +235,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize("case", BAD)
 def test_bad_episodes(changed, train, case):
     env, changes, message = BAD[case]

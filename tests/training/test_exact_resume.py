@@ -116,7 +116,7 @@ QUICK = {
 
 
 # Takes seconds, and runs in every `make test`: exact resume, on and off policy.
-@pytest.mark.slow_except("ppo with gSDE", "sac, hindsight, normalised")
+@pytest.mark.slow_except("ppo with gSDE")
 @pytest.mark.parametrize(
     "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )

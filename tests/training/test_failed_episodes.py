@@ -86,6 +86,7 @@ def test_it_is_of_the_stage_it_was_in(fail):
     assert error.exit_code == 3
 
 
+@pytest.mark.slow
 def test_actions_for_another_space(fail):
     from rlctl.errors import ArtifactError
     from rlctl.play.episode import save_episode

@@ -98,6 +98,7 @@ def test_a_reset_that_hangs(fail):
     assert ", step 0; " in str(error)
 
 
+@pytest.mark.slow
 def test_connections_closed_by_the_environment(fail):
     error, _ = fail(fault="closes files")
     assert "worker 1 ended with exit code 1 while " in str(error)
@@ -121,6 +122,7 @@ def test_bad_behaviour_changes_nothing(train, whole, capfd):
     assert "Traceback" not in printed
 
 
+@pytest.mark.slow
 def test_an_environment_that_cannot_be_closed_is_warned_of(train, capfd):
     train("Misbehaving", {**TINY, "total_timesteps": 32, "task": {"misbehaviour": "changes numpy's errors"}}, envs=ENVS)
     assert "warning: closing environment 0: RuntimeError: closed twice" in capfd.readouterr().err

@@ -89,6 +89,7 @@ def test_goals_are_exchanged_and_rewarded_anew(build):
     np.testing.assert_array_equal(rewards, Plane(10, 1e-6).compute_reward(achieved, goals, {}))
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(("goals", "real"), [(1, 100), (3, 50)])
 def test_the_final_goal_is_what_an_episode_ended_with(build, goals, real):
     model = learn(build("Plane", her={"n_sampled_goal": goals, "goal_selection_strategy": "final"}), 100)
@@ -149,7 +150,7 @@ def test_learning_starts_by_which_every_first_episode_is_over():
     assert replay_arguments(recipe, recipe.her, goals(max_steps=None))["learning_starts"] == 100
 
 
-@pytest.mark.slow_except("Line-settings4-False-None")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "settings", "check", "expected"),
     [

@@ -80,8 +80,8 @@ def start(tmp_path):
 @pytest.mark.parametrize(
     ("number", "code"),
     [
-        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
-        (signal.SIGTERM, 143),
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
         pytest.param(signal.SIGUSR1, 143, marks=pytest.mark.slow),
     ],
 )
@@ -124,6 +124,7 @@ def test_a_killed_run_leaves_no_worker_and_does_not_block_the_next(start, rlctl,
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_two_processes_cannot_write_one_run(start, rlctl, tmp_path):
     training = start(tmp_path, "--set", "eval.every_steps=64")
     wait_for(lambda: list(tmp_path.glob("runs/*/*/checkpoints/0*")))

@@ -93,6 +93,7 @@ def test_the_episode_that_failed_is_reproduced_at_its_level(train, tmp_path):
         env.step(episode.actions[-1])
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("task", "settings", "message"),
     [

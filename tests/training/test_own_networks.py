@@ -159,6 +159,7 @@ def test_a_module_that_changed_is_not_resumed(train, resume, tmp_path, key, name
         resume(result, total_timesteps=256)
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
@@ -212,6 +213,7 @@ def test_an_own_policy_class_trains_resumes_and_exports(train, resume, algo):
     assert all(np.array_equal(ours[key], theirs[key]) for key in ours)
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("name", "problem"),
     [

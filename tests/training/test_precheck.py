@@ -34,6 +34,7 @@ def test_an_environment_that_raises_has_the_exit_code_of_a_failed_task(train, ru
     assert runs() == []
 
 
+@pytest.mark.slow
 def test_without_the_check_it_trains(train, runs, small_ppo):
     assert train("Unseeded", small_ppo, check=False).steps == 256
     assert len(runs()) == 1

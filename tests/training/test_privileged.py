@@ -155,6 +155,7 @@ def test_a_policy_with_a_privileged_critic_starts_another_training(train, tmp_pa
     assert PolicyFile.read(later.last_policy).tensors["critic/var"].max() > 0
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     ("settings", "task", "message"),
     [

@@ -229,6 +229,7 @@ def test_a_fault_of_the_environment_is_named_with_episode_and_step(train, small_
     assert "step 7" in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("every_boundary")
 def test_a_fault_leaves_the_last_boundary_to_resume_from(train, small_ppo, tmp_path):
     with pytest.raises(TaskError):

@@ -244,16 +244,7 @@ OFF_POLICY_CASES |= {
 }
 
 
-@pytest.mark.slow_except(
-    "dict, normalized",
-    "gSDE",
-    "fixed entropy coefficient, three critics",
-    "several steps",
-    "tqc",
-    "crossq",
-    "td3",
-    "dqn",
-)
+@pytest.mark.slow_except("dict, normalized", "gSDE", "tqc", "dqn")
 @pytest.mark.parametrize("name", OFF_POLICY_CASES)
 def test_off_policy_updates_as_sb3(name):
     update, algorithm, case = OFF_POLICY_CASES[name]

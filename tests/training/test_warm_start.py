@@ -61,6 +61,7 @@ def test_a_shipped_actor_gets_a_fresh_critic(train, capfd):
     assert "it has no critic, so training starts with a new one: the first updates" in capfd.readouterr().err
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("env", "settings", "kind", "message"),
     [

@@ -404,6 +404,7 @@ def test_trainings_that_are_real(rlctl, tmp_path):
     assert len(episodes) == 2
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -188,6 +188,7 @@ def test_columns_of_histories():
     assert factors.tolist() == [2.0, 2.0, 2.0, 1.0, 1.0, 1.0] * 2
 
 
+@pytest.mark.slow_except(first=4)
 @pytest.mark.parametrize(
     ("content", "size", "settings", "message"),
     [
@@ -379,6 +380,7 @@ def test_other_files_are_refused(tmp_path):
         import_policy(tmp_path / "policy.pt", ForeignFiles(None, "kuka_iiwa.urdf"))
 
 
+@pytest.mark.slow
 def test_the_command_names_what_it_needs(rlctl, tmp_path):
     write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
     write_yaml(tmp_path / "deploy.yaml", describe_walk())

@@ -250,6 +250,7 @@ def test_a_value_without_a_trace_is_not_known_in_a_log_without_noise():
     assert (friction.known, friction.note) == (False, "this log contains no information about friction.factor")
 
 
+@pytest.mark.slow
 def test_the_built_world_is_tried_first():
     mass = Parameter("mass", "factor", 0.5, 2.0, 1.0)
     unknown = Parameter("friction", "friction", 0.1, 2.0)

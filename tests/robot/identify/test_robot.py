@@ -346,6 +346,7 @@ def test_commands(rlctl, small_log, tmp_path):
     assert "each joint alone, then all" in excited.stdout
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -226,6 +226,7 @@ def test_sensors_that_freeze_or_fail():
         assert (np.diff(bad.astype(int)) >= 0).all()  # once it fails, it stays so
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("action", "problem"),
     [
