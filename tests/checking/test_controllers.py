@@ -15,10 +15,10 @@ def broken(name, twin, **settings):
 CASES = [
     broken("RL824HopperShakes", "HopperDamps", slow=True),
     broken("RL824LeverRepels", "Lever", slow=True),
-    broken("RL824HopperRepels", "HopperDamps"),
-    broken("RL824ArmRepels", "ArmDamps"),
-    broken("RL824CartRepels", "CartKeepsSpeed"),
-    broken("RL824CraneRepels", "Crane"),
+    broken("RL824HopperRepels", "HopperDamps", slow=True),
+    broken("RL824ArmRepels", "ArmDamps", slow=True),
+    broken("RL824CartRepels", "CartKeepsSpeed", slow=True),
+    broken("RL824CraneRepels", "Crane", slow=True),
 ]
 
 

@@ -13,7 +13,7 @@ pytest.importorskip("mujoco")
 FILE = "broken_mirrors.py"
 TWIN = f"{FILE}:RL120MirrorsTurning"
 CASES = [
-    case(f"{FILE}:RL120MirrorsTurningLikeVectors", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:RL120MirrorsTurningLikeVectors", ("RL120", "error"), twin=TWIN, slow=True),
     case(f"{FILE}:RL120TurnsHipsTheSameWay", ("RL120", "error"), twin=TWIN),
     case(f"{FILE}:RL120PrefersItsLeft", ("RL120", "error"), twin=TWIN),
 ]

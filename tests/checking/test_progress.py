@@ -13,18 +13,18 @@ def broken(name, twin, **settings):
 
 
 CASES = [
-    broken("RL622BoatGoesAway", "BoatSeeks", pybullet=True),
-    broken("RL622FlyerGoesAway", "FlyerSeeks"),
-    broken("RL622CartGoesAway", "CartSeeks"),
-    broken("RL622PuckGoesAway", "PuckSeeks", pybullet=True),
-    broken("RL622ArmCostsSuccess", "ArmPaysSuccess"),
-    broken("RL622FlyerCostsSuccess", "FlyerPaysSuccess"),
-    broken("RL622CartCostsSuccess", "CartPaysSuccess"),
-    broken("RL622PuckCostsSuccess", "PuckPaysSuccess", pybullet=True),
+    broken("RL622BoatGoesAway", "BoatSeeks", pybullet=True, slow=True),
+    broken("RL622FlyerGoesAway", "FlyerSeeks", slow=True),
+    broken("RL622CartGoesAway", "CartSeeks", slow=True),
+    broken("RL622PuckGoesAway", "PuckSeeks", pybullet=True, slow=True),
+    broken("RL622ArmCostsSuccess", "ArmPaysSuccess", slow=True),
+    broken("RL622FlyerCostsSuccess", "FlyerPaysSuccess", slow=True),
+    broken("RL622CartCostsSuccess", "CartPaysSuccess", slow=True),
+    broken("RL622PuckCostsSuccess", "PuckPaysSuccess", pybullet=True, slow=True),
     broken("RL125CartTurnsBack", "CartSeeks", slow=True),
-    broken("RL125FlyerTurnsBack", "FlyerSeeks"),
-    broken("RL125HopperTurnsBack", "HopperSeeks"),
-    broken("RL125PuckTurnsBack", "PuckSeeks", pybullet=True),
+    broken("RL125FlyerTurnsBack", "FlyerSeeks", slow=True),
+    broken("RL125HopperTurnsBack", "HopperSeeks", slow=True),
+    broken("RL125PuckTurnsBack", "PuckSeeks", pybullet=True, slow=True),
 ]
 
 
