@@ -63,9 +63,8 @@ def _mark_slow_rows(items, is_complete):
 
 
 def pytest_collection_finish():
-    gc.collect()
-    gc.enable()
     gc.freeze()  # modules and tests stay: collections need not look through them again and again
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

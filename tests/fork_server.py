@@ -34,6 +34,9 @@ FOR_COMMANDS = (
     *("rlctl.evaluation.evaluate", "rlctl.evaluation.report", "rlctl.policy.torch_policy", "rlctl.tasks.listing"),
     *("typer.rich_utils", "typer._adapters", "rich._emoji_codes", "yaml", "onnx"),
 )
+ROOMS_FOR_COMMANDS = (
+    *("rlctl.training", "rlctl.launching", "rlctl.checking", "rlctl.evaluation", "rlctl.runs", "rlctl.storage"),
+)
 """What is imported when it is needed; one that is missing here costs time only."""
 HASH_SEED = "0"
 """Of all forks: that of check-env's processes but one."""
@@ -284,11 +287,9 @@ def main(descriptor, commands):
     for name in FOR_WORKERS + (FOR_COMMANDS if commands else ()):
         importlib.import_module(name)
     if commands:
-        import rlctl.launching
-        import rlctl.training
-
-        for room in (rlctl.training, rlctl.launching):
-            for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
+        for name in ROOMS_FOR_COMMANDS:
+            room = importlib.import_module(name)
+            for module in pkgutil.iter_modules(room.__path__, f"{name}."):
                 importlib.import_module(module.name)
     gc.collect()
     gc.freeze()

@@ -183,7 +183,7 @@ def test_command_of_a_clean_environment(tmp_path):
 # Takes seconds, and runs in every `make test`: all rules by the command, and its exit code.
 def test_command_of_a_broken_environment(tmp_path):
     file = tmp_path / "report.json"
-    chosen = ["--select", "RL1,RL901"]
+    chosen = ["--select", "RL103"]
     run = rlctl(f"{BROKEN}:RL103OftenOutOfRange", "--set", "task.size=4.0", *chosen, "--json", str(file))
     assert run.returncode == 1
     assert run.stdout.startswith("error RL103")
@@ -195,8 +195,18 @@ def test_command_of_a_broken_environment(tmp_path):
     assert finding["fingerprint"].endswith(finding["evidence"]["element"])
     assert (finding["rule"], finding["severity"]) == ("RL103", "error")
     assert finding["evidence"]["expected"] == [-4.0, 4.0]
-    assert content["speed"]["steps_per_second"] > 0
     assert content["environment"]["action_space"].startswith("Box(-1.0, 1.0, (2,)")
+    assert content["not_judged"] == []
+
+
+@pytest.mark.slow
+def test_a_family_of_rules_and_the_speed(tmp_path):
+    file = tmp_path / "report.json"
+    run = rlctl(f"{BROKEN}:RL103OftenOutOfRange", "--select", "RL1,RL901", "--json", str(file))
+    assert run.returncode == 1
+    content = json.loads(file.read_text())
+    assert [finding["rule"] for finding in content["findings"]] == ["RL103"]
+    assert content["speed"]["steps_per_second"] > 0
     assert content["not_judged"] == []
 
 

@@ -38,7 +38,7 @@ def assert_verified(report):
 
 
 # Takes seconds, and runs in every `make test`: an export acts as its policy.
-@pytest.mark.slow_except("ppo-dict-box")
+@pytest.mark.slow_except("sac-vector-matrix")
 @pytest.mark.parametrize(
     ("algo", "observation", "action"),
     [
