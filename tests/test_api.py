@@ -66,6 +66,7 @@ def test_check_env_returns_findings(write_module):
         rlctl.check_env("reech")
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_policy_is_evaluated_on_another_task():
     with pytest.raises(UsageError, match=r"^evaluate: task must be the name of a task, got {'tolerance': 0.1}; "):

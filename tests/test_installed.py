@@ -64,6 +64,7 @@ def listed(result):
     return {(task["name"], task["distribution"]): task for task in json.loads(result.stdout)["tasks"]}
 
 
+@pytest.mark.slow
 def test_a_listing_imports_no_plugin(rlctl, site):
     tasks = listed(rlctl("tasks", "--json", "-", path=site))
     assert tasks["good", "some-robots"] == {

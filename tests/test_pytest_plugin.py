@@ -80,6 +80,7 @@ def test_tasks_of_a_distribution(pytester):
     result.assert_outcomes(passed=23, failed=1)
 
 
+@pytest.mark.slow
 def test_a_distribution_without_tasks(pytester):
     result = run(
         pytester,

@@ -82,6 +82,7 @@ def test_a_goal_is_what_reset_draws_of_an_attribute(name, elements):
     assert len(goals.goals[1000]) == len(elements)
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("name", ["PlanarArm", "UprightArm", "PlanarArmSeesAll", "PosedArm"])
 def test_goals_with_a_constant_are_judged_and_sound(name):
     rules = ["RL125", "RL622", "RL623", "RL624", "RL625"]
@@ -97,6 +98,7 @@ def test_the_reach_is_measured_along_the_axes_that_are_drawn():
     assert reach.centre == pytest.approx([0.0, 0.1])  # along x and z
 
 
+@pytest.mark.slow
 def test_goals_that_are_reached_at_once_are_none_to_come_nearer_to():
     verdict = verdict_of(f"{REACH}:PlanarArmIsThere", "RL623")
     # More time would change nothing, so that it is not counted among the rules that lack time.

@@ -30,6 +30,7 @@ def test_sound_declarations(task):
     assert found(task, "RL120") == set()
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -98,6 +98,7 @@ def test_falling_is_compared_with_going_on():
     assert 0 < evidence["gain"] <= saved
 
 
+@pytest.mark.slow
 def test_stopping_is_compared_from_where_it_begins():
     episode = shared_records_of("broken_envs.py:Clean", "search").role("search")[0]
     finished = dataclasses.replace(episode, rewards=np.array([0.0, 0.0, 9.0]))
@@ -110,6 +111,7 @@ def test_stopping_is_compared_from_where_it_begins():
     assert compare_returns(finished, ended, at=2, longest=6).stopping == pytest.approx(5 * 1.99)
 
 
+@pytest.mark.slow
 def test_hovering_is_found_and_placed():
     finding = finding_of("RL605Hovering")
     # Between 9.6 (0.4 from the goal) and 9.9 (0.1 from it) per step.

@@ -47,7 +47,7 @@ CASES = [
     broken("RL811CrawlerOrder", "RL811", "error", "Crawler", slow=True),
     broken("RL812ArmTouchesNothing", "RL812", "warning", "RL812ArmTouches", slow=True),
     broken("RL812CrawlerOtherFloor", "RL812", "warning", "RL812CrawlerFloor", slow=True),
-    broken("RL813ArmLongPhysicsSteps", "RL813", "warning", "Arm"),
+    broken("RL813ArmLongPhysicsSteps", "RL813", "warning", "Arm", slow=True),
     broken("RL814ArmWeakMotors", "RL814", "warning", "Arm", slow=True),
     broken("RL815ArmOldHand", "RL815", "info", "Arm", slow=True),
     broken("RL815PusherOldCube", "RL815", "warning", "Pusher", slow=True),

@@ -164,6 +164,7 @@ def test_errors_are_a_line_and_a_code(rlctl, write_module, arguments, code, mess
     assert "site-packages" not in result.stderr
 
 
+@pytest.mark.slow
 def test_underscores_are_read_as_dashes(rlctl):
     result = rlctl("eval", "--env_timeout", "5", "--num-envs", "2", "--num_envs", "3", "--min_success", "0.5")
     assert "no run yet" in result.stderr
@@ -179,6 +180,7 @@ def test_a_plugins_traceback_stands_above_the_error(installed_rlctl, write_modul
     assert any("broken.py" in line for line in above)
 
 
+@pytest.mark.slow
 def test_json_goes_to_a_file_besides(rlctl, tmp_path):
     result = rlctl("tasks", "--json", "deep/tasks.json")
     assert (result.returncode, result.stdout) == (0, rlctl("tasks").stdout)

@@ -150,6 +150,7 @@ def test_the_commands_that_come_with_rlctl():
         assert find_module_file(entry.module).name == "command.py"
 
 
+@pytest.mark.slow
 def test_tasks_as_json_has_the_commands(rlctl, site):
     commands = json.loads(rlctl("tasks", "--json", "-", path=site).stdout)["commands"]
     greet = next(command for command in commands if command["name"] == "greet")

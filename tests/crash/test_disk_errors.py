@@ -16,7 +16,6 @@ def errors(part, operations, each=3):
     return tried[part :: each * PARTS]
 
 
-# Takes seconds, and runs in every `make test`: a full disk leaves whole files.
 @pytest.mark.crash
 @parts(3)
 @pytest.mark.parametrize("name", ALGORITHMS)

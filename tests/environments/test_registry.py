@@ -202,6 +202,7 @@ def test_places_that_are_not_there(my_env, tmp_path):
     )
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     ("task", "meant"),
     [
@@ -459,6 +460,7 @@ def test_what_is_no_environment_is_not_called(write_module, tmp_path, name):
     assert not (tmp_path / "launched").exists()
 
 
+@pytest.mark.slow
 def test_an_id_that_a_package_of_this_folder_registers(write_module):
     write_module("driving/__init__.py", "import gymnasium\ngymnasium.register(id='Driving-v0', entry_point=object)\n")
     write_module("driving/other.py", "print('Driving-v0', 'Parking-v0')\n")

@@ -92,6 +92,7 @@ def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation
     assert len({episode.result.seed for episode in evaluation.played}) == 6
 
 
+@pytest.mark.slow
 def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
     assert {row["overlap"] for row in read_table(reach_run.evals_file)} == {0.0}  # the arm touches nothing
 
@@ -113,6 +114,7 @@ def test_json_has_what_ci_needs(evaluation):
     json.dumps(content, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_tolerance_is_a_parameter(reach_run):
     wide = EvalRequest(str(reach_run.path), episodes=4, changes=EnvChanges({"tolerance": 10.0}))
     assert run_evaluation(wide).success_rate == 1.0

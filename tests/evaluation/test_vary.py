@@ -325,6 +325,7 @@ def test_the_worst_contacts_are_gated(rlctl):
     assert "--sim mujoco:0.01 --set randomize=false" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_what_mujoco_has_not_is_said_before_an_episode_is_played(rlctl, tmp_path):
     pytest.importorskip("mujoco")

@@ -187,6 +187,7 @@ def logits_policy(train, write, small, action, logits):
     return TorchActor.load(write(model, "ppo", spec))
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("action", "logits", "other", "near_tie"),
     [

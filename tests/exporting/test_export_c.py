@@ -200,7 +200,7 @@ def read_numbers(library, name, count, kind=ctypes.c_float):
     return list((kind * count).in_dll(ctypes.CDLL(str(library)), name))
 
 
-@pytest.mark.slow_except("1")
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("frames", [1, 3])
 def test_names_bounds_and_units_are_data(frames, small, train, write, tmp_path):

@@ -22,6 +22,7 @@ def env(request):
     env.close()
 
 
+@pytest.mark.slow_except("biped")
 @pytest.mark.pybullet
 def test_it_can_stand(env):
     earned = sum(env.step(STAND)[1] for _ in range(200))

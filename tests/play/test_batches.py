@@ -190,6 +190,7 @@ def test_a_value_that_is_not_finite_is_that_of_an_episode(start):
     )
 
 
+@pytest.mark.slow
 def test_an_action_that_is_not_finite_is_that_of_an_episode(spec, start):
     workers = start(spec, 2, n_workers=1)
     with pytest.raises(DivergedError, match=r"the policy's action is not finite.*\nin environment 0, episode seed"):

@@ -83,6 +83,7 @@ def test_terms_are_recorded(spec, start):
     assert trajectory.rewards == pytest.approx([count + 1.0] * 4, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_overlapping_bodies_are_measured_in_the_first_episodes(spec, start):
     workers = start(EnvSpec(spec("Sunk").task), 2)

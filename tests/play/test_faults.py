@@ -134,7 +134,7 @@ def test_workers_end_with_a_killed_parent(first_seed):
     assert alive == []
 
 
-@pytest.mark.slow_except("True-15", "False-15")
+@pytest.mark.slow_except("True-15")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("built", [True, False])
 def test_to_stop_is_for_the_main_process(spec, start, children, request, number, built):

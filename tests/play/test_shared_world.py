@@ -116,6 +116,7 @@ def test_the_group_of_a_container_or_job_limits_the_processes(monkeypatch, tmp_p
         check_memory("walker.py:Walker", world, 5)
 
 
+@pytest.mark.slow
 def test_an_error_in_the_trial_is_reported_by_the_first_episode(start, write_module):
     source = OF_THE_MODULE.replace("pybullet.stepSimulation", "1 / 0; pybullet.stepSimulation")
     workers = start(EnvSpec(f"{write_module('stands.py', source)}:Still"), 2, n_workers=1)

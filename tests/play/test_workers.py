@@ -74,6 +74,7 @@ def test_a_term_of_weight_0_is_a_metric(spec, start):
     assert [name for name in row if "/" in name] == ["term/count", "term/fixed", "metric/fixed"]
 
 
+@pytest.mark.slow_except("dict", "binary")
 @pytest.mark.parametrize("kind", ["dict", "image", "discrete", "binary"])
 def test_every_kind_of_space(spec, start, kind):
     env = spec("Spaces", kind=kind).make()

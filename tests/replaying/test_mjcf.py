@@ -81,6 +81,7 @@ def worst_error(env) -> float:
     return worst
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_capsules_are_where_pybullet_has_them(name):
     env = EnvSpec(name).make()
@@ -183,6 +184,7 @@ def test_camera_follows_no_arm(reached, tmp_path):
     assert tracked(tmp_path / "reach.rrd") == []
 
 
+@pytest.mark.slow
 def test_camera_follows_a_free_urdf_robot(tmp_path):
     rollout, warnings = play("Tumble", car="r2d2.urdf")
     write_rrd(tmp_path / "r2d2.rrd", rollout, title="r2d2", warn=warnings.append)
@@ -190,6 +192,7 @@ def test_camera_follows_a_free_urdf_robot(tmp_path):
     assert "/world/car/base_link/shape_0" in entities(tmp_path / "r2d2.rrd")
 
 
+@pytest.mark.slow
 def test_the_goal_of_a_small_robot_is_in_view(tmp_path):
     rollout, _ = play("Tumble", car="r2d2.urdf")
     # As if the goal were 6 m to the left of the robot, which is some 1.5 m high.

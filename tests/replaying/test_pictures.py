@@ -139,6 +139,7 @@ def test_a_filmed_and_recorded_episode_of_a_policy_repeats(tmp_path):
     assert run_replay(ReplayRequest(verify=episode.episode)).verification.difference is None
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_film_of_the_beginning_of_an_episode(tmp_path):
     request = ReplayRequest("reach", baseline="zero", video=tmp_path / "film.gif", size="64x64", seconds=0.5)

@@ -41,6 +41,7 @@ def test_nothing_is_recorded_through_a_link(run, tmp_path):
     assert not [*(tmp_path / "precious").iterdir()]
 
 
+@pytest.mark.slow
 def test_episodes_that_are_there_are_kept(run, tmp_path):
     (tmp_path / "000004.npz").write_bytes(b"of a training, which records few of its episodes")
     (episode,) = run_replay(ReplayRequest(str(run.run.path), output=tmp_path)).episodes
@@ -70,6 +71,7 @@ def test_training_records_beside_its_episodes(run):
     np.testing.assert_array_equal(column(recording, "/action")[1], episode.actions)
 
 
+@pytest.mark.slow
 def test_task_and_parameters_can_be_others(run, tmp_path):
     request = ReplayRequest(str(run.run.path), settings=["task.tolerance=0.9"], output=tmp_path)
     (episode,) = run_replay(request).episodes

@@ -164,6 +164,7 @@ def test_actions_for_another_space(tampered, episode):
         verify_episode(load_episode(path), path)
 
 
+@pytest.mark.slow
 def test_as_json_when_identical(replay, episode_file):
     content = as_json(replay("--verify", episode_file, "--json", "-"))
     assert content["verification"]["identical"] is True

@@ -15,6 +15,7 @@ def test_the_last_audit_of_a_run_is_shown(write_run, rlctl):
     assert json.loads(rlctl("runs", "show", run, "--json", "-").stdout)["audit"] == content
 
 
+@pytest.mark.slow
 def test_a_run_that_hardly_succeeds_names_the_command(write_run, rlctl):
     poor, good = write_run("reach/a", evals=((1000, 0.2, 1.0),)), write_run("reach/b", evals=((1000, 0.9, 1.0),))
     assert f"what has it learned instead? rlctl runs show {poor} --audit\n" in rlctl("runs", "show", poor).stdout
@@ -52,6 +53,7 @@ def test_a_time_limit_without_anything_to_play_is_refused(write_run, rlctl):
     )
 
 
+@pytest.mark.slow
 def test_the_value_of_the_recipe_is_beside_the_changed_one(write_run, rlctl):
     changed = {"recipe_changes": {"algo_kwargs.gamma": 0.97}, "recipe_before": {"algo_kwargs.gamma": 0.99}}
     shown = rlctl("runs", "show", write_run("reach/a", **changed)).stdout

@@ -132,6 +132,7 @@ def test_a_copy_of_a_run_is_no_second_seed(root, tmp_path):
         compare([str(first), str(second)], EvalRequest(None, episodes=1))
 
 
+@pytest.mark.slow
 def test_seeds_that_have_not_finished_are_not_compared(root, monkeypatch):
     unfinished = sorted((root / "0.99/Line").iterdir())[1]
     status = RunDirectory.status
@@ -232,6 +233,7 @@ def never_succeeding(result):
     return dataclasses.replace(result, baseline=fail(result.baseline), candidates=candidates)
 
 
+@pytest.mark.slow
 def test_two_policies_that_never_succeed_pass_no_gate_unless_told_to(root):
     one, two = sorted((root / "0.9/Line").iterdir())
     result = never_succeeding(compare([str(one), str(two)], EvalRequest(None, episodes=4)))

@@ -143,6 +143,7 @@ def test_an_event_that_is_part_of_the_problem(make):
     assert make(Pushed()).reset(seed=0)[1] == {"events": {"mass": {"factor": 1.0}}}
 
 
+@pytest.mark.slow
 def test_ranges_widen_with_the_level(make):
     env = make(Cart(), mass={"factor": {"from": [0.9, 1.1], "to": [0.5, 2.1]}})
 

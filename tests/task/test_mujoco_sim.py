@@ -200,6 +200,7 @@ def test_markers_are_drawn_where_they_are_moved():
     assert 30 < (left != right).any(axis=2).sum() < 2000  # two small spheres
 
 
+@pytest.mark.slow
 @needs_egl
 def test_a_near_body_is_drawn_whole_on_wide_ground():
     with closing(MujocoSim(control_dt=0.02, substeps=4)) as sim:

@@ -65,6 +65,7 @@ def test_damaged_metadata(rlctl, install, metadata):
     assert tasks["reach"]["problem"] is None
 
 
+@pytest.mark.slow
 def test_a_broken_line_does_not_take_a_name(rlctl, install):
     site = install("arobots", {"arm": "not a target"})
     site = install("brobots", {"arm": "json:JSONDecoder"}) if not site.exists() else site
@@ -79,6 +80,7 @@ def test_a_broken_line_does_not_take_a_name(rlctl, install):
     ]
 
 
+@pytest.mark.slow
 def test_a_damaged_policy_has_no_score(rlctl, install):
     files = {"robots.py": 'class Env:\n    """Pick up a ball.\n\n    More."""\n', "policies/arm.safetensors": "damaged"}
     tasks = list_by_name(rlctl, install("robots", {"arm": "robots:Env"}, files))

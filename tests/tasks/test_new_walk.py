@@ -92,6 +92,7 @@ def test_a_plugin_of_a_users_dog(tmp_path, monkeypatch):
     check_that_it_stands(plugin, [f"{leg}_shank" for leg in FEET], task.height)
 
 
+@pytest.mark.slow
 def test_two_legs_step_in_time_with_a_clock(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_dog(tmp_path, pairs=(0.0,))

@@ -138,6 +138,7 @@ def test_an_observation_in_a_dict_space(write_module, monkeypatch, tmp_path):
     assert (place["name"], place["shape"], place["low"]) == ("place", [3], None)
 
 
+@pytest.mark.slow
 def test_a_gymnasium_id():
     content = describe("Pendulum-v1").content
     assert content["target"] == "gymnasium.envs.classic_control.pendulum:PendulumEnv"

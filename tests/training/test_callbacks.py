@@ -179,6 +179,7 @@ def test_the_flag_is_a_key_of_the_recipe_and_part_of_the_request():
     assert list(recipe.callbacks) == [f"{Path.cwd()}/a.py:A", f"{Path.cwd()}/a.py:C", "d:E"]
 
 
+@pytest.mark.slow
 def test_wrong_arguments_and_parameters_are_named(train):
     with pytest.raises(TaskError, match=r"callback .*Adaptive': TypeError: .*unexpected keyword argument 'speed'"):
         train("Line", {**SMALL_PPO, "callbacks": {f"{FILE}:Adaptive": {"speed": 1}}})
@@ -236,6 +237,7 @@ def test_a_schedule_that_sb3_callbacks_replace_is_reported(train, capsys):
     assert "NewSchedule: its model.lr_schedule is a function, which a checkpoint does not" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_callback_cannot_reach_into_the_environments(train):
     with pytest.raises(TaskError, match=r"on_segment at step 64: AttributeError: methods of environments in workers"):
         train("Line", {**SMALL_PPO, "callbacks": {f"{SB3}:ReachesIn": None}})

@@ -108,6 +108,7 @@ def test_another_task_is_refused_unless_forced(plugin, resume, capfd, what):
     assert [row["steps"] for row in rows(run.metrics_file)] == ["32", "64", "96", "128"]
 
 
+@pytest.mark.slow
 def test_a_plugin_that_is_gone(plugin, resume):
     folder, run = plugin
     before = run.status_file.read_bytes()

@@ -94,6 +94,7 @@ def test_policy_file_has_all_stages(staged):
     assert [info.stages[number - 1].parameters for number in (1, 2)] == [EASY, HARD]
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(("stage", "rate"), [(None, 0.0), (1, 1.0), (2, 0.0)])
 def test_eval_of_a_stage(staged, stage, rate):
     result = run_evaluation(EvalRequest(str(staged.run.path), episodes=3, stage=stage))

@@ -132,7 +132,7 @@ def test_discrete_actions_are_cloned(record, tmp_path):
     assert [int(policy.predict(np.array([x], np.float32))) for x in (-0.3, -0.1, 0.1, 0.3)] == [1, 1, 0, 0]
 
 
-@pytest.mark.slow_except("sac-actor.log_std.bias")
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "name"), [("ppo", "log_std"), ("sac", "actor.log_std.bias")])
 def test_noise_and_normalisation_after_cloning(record, train, monkeypatch, case, name):
     monkeypatch.setattr(demonstrations, "_UPDATES", 1)

@@ -82,6 +82,7 @@ def test_a_fault_is_named_and_the_run_goes_on_after_it(fail, resume, monkeypatch
     assert_same_run(whole, run)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_child_left")
 def test_a_reset_that_fails_is_the_next_episodes(fail):
     error, _ = fail(fault="raise", at_reset=True)

@@ -272,6 +272,7 @@ def test_learning_waits_for_the_first_whole_episode(build):
     assert learn(rollouts, 44)._n_updates > 0
 
 
+@pytest.mark.slow
 def test_a_buffer_without_room_for_an_episode_ends_a_run(train, tmp_path):
     # 13 rows: the second episode writes over the first from its fourth step on.
     with pytest.raises(RecipeError) as caught:

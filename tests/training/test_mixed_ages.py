@@ -40,6 +40,7 @@ def play(env, steps):
     return env.finish()
 
 
+@pytest.mark.slow
 def test_first_episodes_are_short_and_no_results(make):
     env = make()
     env.reset()

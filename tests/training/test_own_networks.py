@@ -234,6 +234,7 @@ def test_what_is_wrong_with_a_policy_class(train, tmp_path, name, problem):
     assert not list((tmp_path / "runs").glob("*"))
 
 
+@pytest.mark.slow
 def test_an_own_activation_of_a_recurrent_policy_is_refused(train):
     given = {**TINY, "algo": "recurrent_ppo", "policy_kwargs": {"activation_fn": "torch.nn:Mish"}}
     with pytest.raises(UsageError, match="a recurrent_ppo network with activation 'Mish' is not supported"):

@@ -21,6 +21,7 @@ def test_an_error_refuses_before_a_run_begins(train, runs, small_ppo):
     assert runs() == []
 
 
+@pytest.mark.slow
 def test_an_environment_that_raises_has_the_exit_code_of_a_failed_task(train, runs, small_ppo, write_module):
     source = """
         from tests.training.envs import Line

@@ -8,6 +8,7 @@ from rlctl.recipe import recipe as recipes
 from rlctl.runs.train_request import TrainRequest
 
 
+@pytest.mark.slow_except(first=3)
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -118,6 +118,7 @@ def test_the_best_of_all_trials_is_a_recipe(played, tmp_path, rlctl):
     assert unchanged[:2] == ["0", "0.0003"]
 
 
+@pytest.mark.slow
 def test_too_few_evaluations_are_named(played, tmp_path, capsys):
     begin(tmp_path, RATES, trials=1, settings={"algo_kwargs": {"n_steps": 32, "batch_size": 32}})
     assert (
@@ -145,6 +146,7 @@ def test_a_step_keeps_what_the_one_before_found(played, tmp_path):
     assert all("algo_kwargs.gamma" in each.values for each in by_step[3])
 
 
+@pytest.mark.slow
 def test_no_choice_is_tried_twice(played, tmp_path):
     tuning = begin(tmp_path, "algo_kwargs.gamma=0.9,0.95,0.98", trials=20, settings={"algo_kwargs": {"gamma": 0.9}})
     assert tuning.trials[0].values == {}
@@ -210,7 +212,7 @@ def test_an_interrupted_tuning_goes_on(played, tmp_path, interrupted_at):
     assert again == tuning
 
 
-@pytest.mark.slow_except("1")
+@pytest.mark.slow
 @pytest.mark.parametrize("killed_at", [1, 3])
 def test_a_trial_that_was_killed_is_tried_again(played, tmp_path, killed_at):
     played.killed_at = killed_at
@@ -267,6 +269,7 @@ def test_a_storage_that_cannot_be_opened(tmp_path):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_several_at_a_time(played, tmp_path):
     tuning = begin(tmp_path, RATES, trials=8, jobs=4)
     assert sorted(each.number for each in tuning.trials) == list(range(9))

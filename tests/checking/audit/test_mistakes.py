@@ -54,6 +54,7 @@ def play(name: str, only: tuple[str, ...] = (), **parameters: object) -> Ranking
     return rank([fact.value for fact in facts], has_success=True)
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.pybullet
 @pytest.mark.parametrize("case", QUICK, ids=lambda case: case.broken)
 def test_names_who_earns_too_much_and_the_term(case):
@@ -61,6 +62,7 @@ def test_names_who_earns_too_much_and_the_term(case):
     assert [(one.competitor, one.term) for one in ranking.beaten] == [(case.competitor, case.term)]
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.pybullet
 @pytest.mark.parametrize("case", QUICK, ids=lambda case: case.twin)
 def test_is_silent_for_a_sound_reward(case):

@@ -308,6 +308,7 @@ def test_a_clip_in_the_graph(tmp_path, monkeypatch):
         import_policy(file, ForeignFiles(None, A1), settings={"control_dt": 0.02}, output=tmp_path / "b.safetensors")
 
 
+@pytest.mark.slow
 def test_a_clip_without_a_rate_or_for_another_policy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_torchscript(tmp_path / "policy.pt", [24, 8, 12])
@@ -323,6 +324,7 @@ def test_a_clip_without_a_rate_or_for_another_policy(tmp_path, monkeypatch):
         import_policy(tmp_path / "walk.pt", ForeignFiles(walk, A1, motion=clip, motion_rate=50.0))
 
 
+@pytest.mark.slow
 def test_an_imported_policy_is_not_trained_and_has_no_recipe(rlctl, tmp_path):
     write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
     import_policy(
@@ -407,6 +409,7 @@ def test_one_command_imports_and_plays(rlctl, tmp_path):
     assert "Deployed: policy.safetensors" in first.stdout
 
 
+@pytest.mark.slow
 def test_an_import_to_play_keeps_what_is_there(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_torchscript(tmp_path / "policy.pt", [45, 8, 12])

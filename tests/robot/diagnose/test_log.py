@@ -193,6 +193,7 @@ def test_pickles_are_never_loaded(tmp_path, info, rows):
         read_robot_log(path, info)
 
 
+@pytest.mark.slow
 def test_of_large_files_parts_are_read(tmp_path, info, rows, monkeypatch):
     many = np.tile(rows, (200, 1))
     many[:, 0] = np.arange(len(many)) * 0.1

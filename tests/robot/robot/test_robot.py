@@ -108,6 +108,7 @@ def test_a_policy_file_is_played_in_its_own_task(tmp_path):
         run_robot(RobotRequest(policy, policy=policy), lambda _: None, changes=UNCHANGED, gates=NO_GATES)
 
 
+@pytest.mark.slow
 def test_a_policy_with_a_stack_of_frames_is_compared_with_single_observations(tmp_path):
     # The place is 1, and from the second step on the older of two frames has one step less than the newer.
     weight = [[0, -0.1, 0, 0, 0, 0], [0, 0, 0, 0, 0.1, 0]]
@@ -182,6 +183,7 @@ def test_a_controller_gets_what_is_measured_and_sends_targets(tmp_path):
     assert places[120] == places[121] == places[122] != places[123]
 
 
+@pytest.mark.slow
 def test_a_controller_that_commands_nothing():
     report = play(control_by_udp, lambda packet: Kind.NO_COMMAND, task=CART, episodes=1, controller=True,
                   options={"reads": "packets"})  # fmt: skip
@@ -207,6 +209,7 @@ def test_faults_repeat_with_the_seed():
     assert reports[0].scores[1].commands.lost == reports[1].scores[1].commands.lost > 0
 
 
+@pytest.mark.slow
 def test_sensors_that_freeze_or_fail():
     seen = []
 

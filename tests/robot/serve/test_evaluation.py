@@ -105,6 +105,7 @@ def test_a_server_that_does_not_run_its_policy_is_said_to(reach_server, rlctl):
     assert "for 120 of 120 answers the server held or stopped instead of running the policy" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_server_that_is_not_there_or_of_another_task(reach_server, capfd):
     with pytest.raises(UsageError, match="no policy server answers"):
         run_evaluation(EvalRequest("reach", baseline="ws://127.0.0.1:1"))

@@ -70,6 +70,7 @@ def test_errors(tmp_path, monkeypatch, settings, code, error):
     assert error in str(problem.value)
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize("options", [[], ["--self-test"]])
 def test_without_the_extra(rlctl, tmp_path, options):
     write_policy(tmp_path / "policy.safetensors")
