@@ -73,7 +73,7 @@ def save(tmp_path):
     return saved
 
 
-@pytest.mark.slow_except("ppo-vector-box-{}", "dqn-vector-discrete-{'policy_kwargs': {'net_arch': [8, 8]}}")
+@pytest.mark.slow_except("ppo-vector-box-{}", "dqn-vector-discrete-{'policy_kwargs': {'net_arch':")
 @pytest.mark.parametrize(
     ("algo", "observation", "action", "kwargs"),
     [*CASES, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW_CASES)],
