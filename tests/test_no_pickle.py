@@ -8,6 +8,8 @@ import json
 import pickle
 import sys
 
+import pytest
+
 from tests import fork_server
 from tests.test_layers import ROOT, files, imports
 from tests.training.conftest import ENVS
@@ -42,7 +44,7 @@ def watched(folder, *commands):
     return json.loads(printed[-1][1:])
 
 
-# Takes seconds, and runs in every `make test`: nothing else guards that no command unpickles.
+@pytest.mark.slow
 def test_the_life_of_a_run(tmp_path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(

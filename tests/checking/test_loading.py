@@ -61,6 +61,7 @@ def test_what_a_constructor_raises_is_named(name, message):
     assert re.search(message, finding.message)
 
 
+@pytest.mark.slow
 def test_an_exception_without_a_readable_message_is_a_finding_of_its_call():
     (finding,) = findings("broken_loading.py:RaisingUnreadablyInStep", "RL207")
     assert finding.message.startswith("step 1 raised UnreadableError: (message unavailable: RuntimeError)")
@@ -101,6 +102,7 @@ def test_a_missing_file_is_named_without_the_words_around_it():
     assert finding.evidence["file"] == "data/table.csv"
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_missing_model_of_a_reset_is_named():
     (finding,) = findings("broken_loading.py:RL007NoModelAtReset", "RL007")

@@ -91,6 +91,7 @@ def test_goals_with_a_constant_are_judged_and_sound(name):
     assert verdict.judged == rules
 
 
+@pytest.mark.slow
 def test_the_reach_is_measured_along_the_axes_that_are_drawn():
     goals = shared_records_of(f"{REACH}:UprightArm", "goals").require_fact("goals")
     (reach,) = goals.reaches.values()

@@ -132,6 +132,7 @@ def test_a_frame_without_inertial_is_named():
     assert finding.evidence == {}
 
 
+@pytest.mark.slow
 def test_a_joint_without_effort_limit_is_named():
     (finding,) = findings("broken_models.py:NoEffort", "RL207")
     assert "cart_without_effort.urdf gives no effort limit for joint 'shoulder'" in finding.message

@@ -67,6 +67,7 @@ def test_without_an_instance_there_is_a_finding_and_exit_code_3(task, expected, 
     assert report.verdict.not_judged["RL301"] == "no instance could be built"
 
 
+@pytest.mark.slow
 def test_segfault_is_a_finding(in_root):
     report = check(EnvSpec(f"{BROKEN}:RL208Segfaults"), env_timeout_s=10)
     (finding,) = report.verdict.findings
@@ -180,7 +181,7 @@ def test_command_of_a_clean_environment(tmp_path):
     assert "\x1b" not in run.stdout
 
 
-# Takes seconds, and runs in every `make test`: all rules by the command, and its exit code.
+# Takes a second, and runs in every `make test`: check-env as a command, its report and its exit code.
 def test_command_of_a_broken_environment(tmp_path):
     file = tmp_path / "report.json"
     chosen = ["--select", "RL103"]

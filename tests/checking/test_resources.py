@@ -16,7 +16,7 @@ FILE = "broken_resources.py"
 CASES = [
     case(f"{FILE}:RL405LeavesBodies", ("RL405", "error"), twin="broken_repeats.py:OwnWorld", pybullet=True, slow=True),
     case(f"{FILE}:RL405KeepsFiles", ("RL405", "warning"), slow=True),
-    case(f"{FILE}:RL405KeepsThreads", ("RL405", "warning")),
+    case(f"{FILE}:RL405KeepsThreads", ("RL405", "warning"), slow=True),
     case(f"{FILE}:RL405KeepsMemory", ("RL405", "warning"), twin=f"{FILE}:RL405Caches", slow=True),
     case(f"{FILE}:RL404ClassSpaces", ("RL404", "warning")),
     case(f"{FILE}:RL404ClassObservations", ("RL404", "info")),

@@ -36,7 +36,7 @@ CASES = [
     case("broken_envs.py:RL105ReusedMemory", ("RL105", "info")),
     case("broken_envs.py:RL106UnboundedActions", ("RL106", "error")),
     case("broken_envs.py:RL106WideActions", ("RL106", "info")),
-    case("broken_spaces.py:RL108OddImage", ("RL108", "warning")),
+    case("broken_spaces.py:RL108OddImage", ("RL108", "warning"), slow=True),
     case("broken_spaces.py:RL108FloatPicture", ("RL108", "warning"), twin="broken_spaces.py:RL108Tiles", slow=True),
     case("broken_spaces.py:RL108TwoAxes", ("RL108", "warning"), twin="broken_spaces.py:RL108FloatTable", slow=True),
     case("broken_spaces.py:RL108Dark", ("RL108", "warning"), twin="broken_spaces.py:RL108Seen", slow=True),

@@ -83,6 +83,7 @@ def test_what_is_installed_is_made(task):
     env.close()
 
 
+@pytest.mark.slow
 def test_what_does_not_exist_is_a_usage_error():
     for task in ("reech", "no_such_module:Env", "NoSuchEnv-v0"):
         with pytest.raises(UsageError):

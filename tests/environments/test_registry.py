@@ -262,6 +262,7 @@ def test_a_vectorised_environment_is_named_as_one(my_env, write_module):
         EnvSpec("many.py:make").make()
 
 
+@pytest.mark.slow
 def test_gymnasium_ids(write_module, monkeypatch):
     assert error(UsageError, "Pendulun-v1") == (
         "Gymnasium has no environment 'Pendulun-v1'. Did you mean 'Pendulum-v1'? "

@@ -132,6 +132,7 @@ def test_a_description_that_is_none(write):
     )
 
 
+@pytest.mark.slow
 def test_no_bit_of_an_export_changes_unnoticed(write):
     path = write([node("Add", "obs", "w")], [constant("w", np.arange(4, dtype=np.float32))])
     whole = path.read_bytes()

@@ -60,7 +60,7 @@ HANGS = ("stopped", "endless", "sleep")
 QUICK = ("raise", "out of memory")
 
 
-@pytest.mark.slow_except("raise")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [each if each in QUICK else pytest.param(each, marks=pytest.mark.slow) for each in (*ENDS, *HANGS)],

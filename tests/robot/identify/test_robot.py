@@ -96,6 +96,7 @@ def identified(recorded, tmp_path_factory):
     return identify_robot(str(ROBOT), path, threads=1)
 
 
+@pytest.mark.slow
 def test_hidden_values_are_found(identified):
     for quantity, hidden in HIDDEN.items():
         for joint, right in zip(["shoulder", "elbow"], np.broadcast_to(hidden, 2), strict=True):
