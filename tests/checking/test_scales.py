@@ -38,11 +38,11 @@ CASES = [
     ),
     broken("RL119RoverCentimetres", "broken_meaning.py:Rover", "RL119", slow=True),
     broken("RL119DroneCentimetres", "broken_meaning.py:Drone", "RL119", slow=True),
-    broken("RL119ArmCentimetres", "mujoco_robots.py:MujocoArm", "RL119"),
-    broken("RL119ReachCentimetres", "broken_reach.py:Arm", "RL119"),
+    broken("RL119ArmCentimetres", "mujoco_robots.py:MujocoArm", "RL119", slow=True),
+    broken("RL119ReachCentimetres", "broken_reach.py:Arm", "RL119", slow=True),
     broken("RL119HopperCentimetres", "mujoco_robots.py:MujocoHopper", "RL119", slow=True),
-    broken("RL119ReacherCentimetres", REACHER, "RL119", pybullet=True),
-    broken("RL119PusherCentimetres", "robots.py:Pusher", "RL119", pybullet=True),
+    broken("RL119ReacherCentimetres", REACHER, "RL119", pybullet=True, slow=True),
+    broken("RL119PusherCentimetres", "robots.py:Pusher", "RL119", pybullet=True, slow=True),
 ]
 
 

@@ -18,9 +18,11 @@ from tests.checking.judging import case, check_case, mark_slow, shared_records_o
 CASES = [
     case("broken_speed.py:RL901SlowStep", ("RL901", "warning"), slow=True),
     case("broken_speed.py:RL903Sleeps", ("RL903", "warning"), slow=True),
-    case("broken_speed.py:RL903Renders", ("RL903", "warning"), twin="broken_speed.py:RL903Sees"),
+    case("broken_speed.py:RL903Renders", ("RL903", "warning"), twin="broken_speed.py:RL903Sees", slow=True),
     case("broken_speed.py:RL904ReadsFile", ("RL904", "warning"), slow=True),
-    case("broken_speed.py:RL904Reconnects", ("RL904", "warning"), twin="broken_speed.py:World", pybullet=True),
+    case(
+        "broken_speed.py:RL904Reconnects", ("RL904", "warning"), twin="broken_speed.py:World", pybullet=True, slow=True
+    ),
 ]
 STEP = TimedCall("pybullet.stepSimulation", "world.py:10", 0.61)
 NOTHING = Speed(66e-6, 52e-6, 200, 5, [STEP], [], [], False)
