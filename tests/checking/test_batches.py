@@ -11,9 +11,15 @@ pytest.importorskip("mujoco")
 FILE = "broken_batches.py"
 SOUND = f"{FILE}:Point"
 CASES = [
-    case(f"{FILE}:RL406ScalesByAll", ("RL406", "error"), twin=f"{FILE}:RL406ScalesByEach"),
+    case(f"{FILE}:RL406ScalesByAll", ("RL406", "error"), twin=f"{FILE}:RL406ScalesByEach", slow=True),
     case(f"{FILE}:RL406SharesNoise", ("RL406", "error"), twin=SOUND),
-    case(f"{FILE}:RL407ResetsAllGoals", ("RL407", "error"), ("RL406", "error"), twin=f"{FILE}:RL407ResetsItsGoal"),
+    case(
+        f"{FILE}:RL407ResetsAllGoals",
+        ("RL407", "error"),
+        ("RL406", "error"),
+        twin=f"{FILE}:RL407ResetsItsGoal",
+        slow=True,
+    ),
     case(f"{FILE}:RL407MovesAllBases", ("RL407", "error"), ("RL406", "warning"), twin=f"{FILE}:RL407MovesItsBase"),
     case(f"{FILE}:RL408OneRow", ("RL408", "error"), twin=SOUND),
     case(f"{FILE}:RL408OneGoal", ("RL408", "error"), twin=SOUND),

@@ -198,6 +198,7 @@ def test_waived_findings_are_listed_with_the_reason_and_do_not_count(waiving):
     assert ", 1 waived; " in waiving.summarize()
 
 
+@pytest.mark.slow_except(first=1)
 @pytest.mark.parametrize(
     ("task", "message"),
     [

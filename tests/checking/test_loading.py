@@ -43,6 +43,7 @@ def test_arguments_are_named_and_how_to_give_them():
     assert "(--set task.gain=...)" in finding.fix
 
 
+@pytest.mark.slow_except(first=2)
 @pytest.mark.parametrize(
     ("name", "message"),
     [

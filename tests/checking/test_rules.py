@@ -72,7 +72,7 @@ CASES = [
     ),
     case("broken_repeats.py:RL402CloseBreaks", ("RL402", "error")),
     case("broken_repeats.py:RL403OnlyOne", ("RL403", "error")),
-    case("broken_envs.py:RL501TimeLimitTerminates", ("RL501", "warning")),
+    case("broken_envs.py:RL501TimeLimitTerminates", ("RL501", "warning"), slow=True),
     case("broken_envs.py:RL502BothFlags", ("RL502", "error")),
     case("broken_envs.py:RL503Endless", ("RL503", "warning"), slow=True),
     case("broken_envs.py:RL504EndsAtOnce", ("RL504", "warning")),
@@ -133,6 +133,7 @@ def test_hindsight_rewards_are_compared():
     assert finding.evidence["value"] - finding.evidence["expected"] == pytest.approx(0.5)
 
 
+@pytest.mark.slow_except("LosesItsGoal")
 @pytest.mark.parametrize("name", ["NoReward", "LosesItsGoal"])
 def test_hindsight_rewards_that_cannot_be_compared_are_the_matter_of_other_rules(name):
     verdict = verdict_of(f"broken_goals.py:{name}", "RL614")
@@ -145,6 +146,7 @@ def test_a_number_that_is_too_large_for_a_float_is_left_out():
     assert dict(find_numbers({"hash": 10**400, "terms": {"hash": 10**400, "distance": 1}})) == {"terms/distance": 1.0}
 
 
+@pytest.mark.slow
 def test_out_of_range_is_placed():
     (finding,) = findings("broken_envs.py:RL103OutOfRange", "RL103")
     assert re.match(
@@ -189,6 +191,7 @@ def test_state_that_reset_keeps_is_named():
     assert finding.fix == "Set back in reset: self.position, self.actions."
 
 
+@pytest.mark.slow
 def test_state_without_effect_is_not_named():
     (finding,) = findings("broken_repeats.py:FirstEpisodeDiffers", "RL302")
     assert finding.message.endswith("; the first episode of an instance differs from all later ones")

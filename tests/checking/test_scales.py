@@ -15,7 +15,7 @@ def broken(name, twin, *rules, **settings):
 REACHER = "broken_reach_bullet.py:Reacher"
 CASES = [
     broken("RL625RoverOnePercent", "broken_meaning.py:Rover", "RL625", slow=True),
-    broken("RL625ReachOnePercent", "broken_reach.py:Arm", "RL625"),
+    broken("RL625ReachOnePercent", "broken_reach.py:Arm", "RL625", slow=True),
     broken("RL625RL706ReacherOnePercent", REACHER, "RL625", "RL706", pybullet=True, slow=True),
     broken("RL625BoatOnePercent", "broken_progress.py:BoatSeeks", "RL625", pybullet=True, slow=True),
     broken("RL625FlyerOnePercent", "broken_progress.py:FlyerSeeks", "RL625", pybullet=True, slow=True),

@@ -68,6 +68,7 @@ def test_fewer_episodes_are_enough_for_a_slow_environment(slow):
     assert "RL502" in judge(records, ["RL502"]).judged
 
 
+@pytest.mark.slow
 def test_the_last_line_says_what_more_time_would_do(slow):
     records = play(slow, ["comparisons"], 0.15, 1.0)
     rules = ["RL301", "RL302"]

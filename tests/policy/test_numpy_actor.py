@@ -93,6 +93,7 @@ def act(actor, observation, seed, step):
     return stored[0], action[0]
 
 
+@pytest.mark.slow_except(first=8)
 @pytest.mark.parametrize("case", CASES)
 def test_it_acts_as_torch_does(policy, case):
     file, torch_actor = policy(case)
@@ -105,6 +106,7 @@ def test_it_acts_as_torch_does(policy, case):
         np.testing.assert_allclose(act(actor, observation, 0, step)[1], expected, atol=2e-6)
 
 
+@pytest.mark.slow_except(first=8)
 @pytest.mark.parametrize("case", [case for case in CASES if "dict" not in case and "image" not in case])
 def test_samples_stay_in_the_space(policy, case):
     file, _ = policy(case)

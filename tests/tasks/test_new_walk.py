@@ -203,7 +203,7 @@ def test_wheels_are_no_legs(tmp_path, monkeypatch):
         new.create("wheeled-dog", model="dog.xml", walk=True)
 
 
-@pytest.mark.slow_except(first=1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("before", "after", "note"),
     [

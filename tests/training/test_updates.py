@@ -87,6 +87,7 @@ PPO_CASES = {
 }
 
 
+@pytest.mark.slow_except("tanh", "gSDE", "advantages as they are")
 @pytest.mark.parametrize("name", PPO_CASES)
 def test_ppo_updates_as_sb3(name):
     one, other = make_ppo(**PPO_CASES[name]), make_ppo(**PPO_CASES[name])
