@@ -43,7 +43,7 @@ def show(report: CheckReport, form: str, target: str | None) -> None:
         files.write_result(Path(str(target)), FORMATS[form](report).encode())
         print(f"{report.summarize()}; written to {target}", file=sys.stderr)
     elif form == "text":
-        _print(output.out(), report)
+        print_report(output.out(), report)
     else:
         output.results().write(FORMATS[form](report))
         output.results().flush()
@@ -86,14 +86,15 @@ def to_text(report: CheckReport) -> str:
     """Return a report as plain text, a line for each thing."""
     stream = io.StringIO()
     plain: dict[str, Any] = {"markup": False, "highlight": False, "emoji": False, "soft_wrap": True}
-    _print(Console(file=stream, width=1000, color_system=None, **plain), report)
+    print_report(Console(file=stream, width=1000, color_system=None, **plain), report)
     return stream.getvalue()
 
 
 FORMATS = {"text": to_text, "json": to_json, "sarif": to_sarif, "junit": to_junit, "github": to_annotations}
 
 
-def _print(out: Console, report: CheckReport) -> None:
+def print_report(out: Console, report: CheckReport) -> None:
+    """Print a report as text."""
     for _, findings in itertools.groupby(report.verdict.findings, key=lambda finding: (finding.severity, finding.rule)):
         _print_rule(out, list(findings))
     out.print(report.summarize(), style="bold" if out.is_terminal else None)
@@ -112,7 +113,7 @@ def _print_rule(out: Console, findings: list[RuleFinding]) -> None:
     body.rstrip()
     # Not wrapped in files and pipes: one line each is easier to search.
     lines = [Padding(body, (0, 0, 0, 2))] if out.is_terminal else [Text("  ") + line for line in body.split("\n")]
-    out.print(*lines, "", sep="\n")
+    out.print(*lines, "", sep="\n", soft_wrap=not out.is_terminal)
 
 
 def _add(body: Text, finding: RuleFinding) -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import io
 import json
 import os
 import re
@@ -14,11 +15,12 @@ import pydantic
 import pytest
 import typer
 from gymnasium import spaces
+from rich.console import Console
 
 from rlctl import cli
 from rlctl.checking import tool_formats
 from rlctl.checking.check import CheckReport, CheckVerdict, judge
-from rlctl.checking.formats import FORMATS, pair_targets, show_notes, to_text
+from rlctl.checking.formats import FORMATS, pair_targets, print_report, show_notes, to_text
 from rlctl.checking.records import Built, Finished, Records
 from rlctl.checking.rule import RuleFinding, Severity
 from rlctl.checking.rules import FAMILIES, PROCESSES, RULES, choose_rules, find_needs, find_rule
@@ -186,6 +188,15 @@ def test_text_has_the_finding_its_numbers_and_its_fix(broken):
     assert text.startswith("error RL601  reward not finite\n  the reward is nan at step 13\n  seed 1000, episode 0, ")
     assert "\n  fix: Find the division, logarithm or diverging simulation that causes it.\n" in text
     assert "\x1b" not in text
+
+
+def test_a_narrow_terminal_cuts_no_finding_off(broken):
+    stream = io.StringIO()
+    print_report(Console(file=stream, width=40, force_terminal=True, color_system=None, soft_wrap=True), broken)
+    words = stream.getvalue().split()
+    for finding in broken.verdict.findings:
+        fix = f"fix: {finding.fix}".split()
+        assert fix in [words[place : place + len(fix)] for place, word in enumerate(words) if word == "fix:"]
 
 
 def test_waived_findings_are_listed_with_the_reason_and_do_not_count(waiving):
