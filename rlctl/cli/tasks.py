@@ -180,7 +180,7 @@ def new_task(
     model: Annotated[
         str | None, Option("Your robot: a URDF or MJCF file, copied with its meshes.", metavar="FILE")
     ] = None,
-    link: Annotated[str | None, Option("Link of --model that is to reach the goal.", metavar="LINK")] = None,
+    link: Annotated[str | None, Option("Link, or site, of --model that is to reach the goal.", metavar="LINK")] = None,
     walk: Annotated[
         bool, Option("--model has legs and is free: a task in which it follows velocity commands.", ("--walk",))
     ] = False,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +32,12 @@ class Tip:
 
     link: str
     point: Array | None  # [m], shape (3,), in the frame of the link; None for its origin
+    site: str = ""  # the site of an MJCF file that the point is
+
+    def __str__(self) -> str:
+        if self.site:
+            return f"{self.site!r} of {self.link!r}"
+        return repr(self.link) if self.point is None else f"the end of {self.link!r}"
 
 
 class ArmModel:
@@ -95,27 +101,50 @@ class ArmModel:
                 gripper |= {other for joint in fingers for other in (joint, *beyond[joint])}
         return gripper
 
-    def choose_point(self, link: str) -> Tip:
-        """Return a link with its origin, or, if no joint moves that, with the end of its shapes.
+    def list_sites(self) -> dict[str, Tip]:
+        """Return the sites of an MJCF file that joints move."""
+        tips = {}
+        for number in range(self._model.nsite):
+            name = self._model.site(number).name.partition("/")[2]
+            link = self.body.parts.link_names.get(int(self._model.site_bodyid[number]), "")
+            if name and link in self.body.link_names and self.list_joints_to(link):
+                tips[name] = Tip(link, np.round(self._model.site_pos[number], 6) + 0.0, name)
+        return tips
 
-        Raises `UsageError` if none of these moves.
+    def choose_point(self, link: str) -> Tip:
+        """Return a link with the last of its sites that is called after a tool, or with its origin, or with the end of
+        its shapes, if the link's own joint moves that, but not the origin.
+
+        Raises `UsageError` if no joint moves any of these.
         """
-        if self._moves(link, np.zeros(3)):
-            return Tip(link, None)
-        end = self._find_end(link)
-        if end is None or not self._moves(link, end):
+        tools = [tip for name, tip in self.list_sites().items() if tip.link == link and _is_tool_site(name)]
+        if tools:
+            return tools[-1]
+        origin, end, own = Tip(link, None), self._find_end(link), self.list_joints_to(link)[-1:]
+        turns_only = end is not None and self.moves(Tip(link, end), own) and not self.moves(origin, own)
+        if turns_only:
+            return Tip(link, end)
+        if not self.moves(origin):
             raise UsageError(f"--link {link!r}: it only turns on the spot; choose another of: {self._list_moved()}")
-        return Tip(link, end)
+        return origin
 
     def _list_moved(self) -> str:
-        return ", ".join(link for link in self.body.link_names if self._moves(link, np.zeros(3))) or "none moves"
+        return ", ".join(link for link in self.body.link_names if self.moves(Tip(link, None))) or "none moves"
 
-    def _moves(self, link: str, point: Array) -> bool:
-        rng, places = np.random.default_rng(0), []
+    def moves(self, tip: Tip, joints: Sequence[int] | None = None) -> bool:
+        """Return whether joints, all by default, move a tip where the others are in several places."""
+        rng = np.random.default_rng(0)
+        low, high = self.find_range()
+        moved = range(len(low)) if joints is None else joints
         for _ in range(5):
-            self.body.set_joints(rng.uniform(*self.find_range()))
-            places.append(self.locate(Tip(link, point)))
-        return bool(np.ptp(places, axis=0).max() > _STILL)
+            places, pose = [], rng.uniform(low, high)
+            for _ in range(2):
+                pose[moved] = rng.uniform(low, high)[moved]
+                self.body.set_joints(pose)
+                places.append(self.locate(tip))
+            if np.ptp(places, axis=0).max() > _STILL:
+                return True
+        return False
 
     def _find_end(self, link: str) -> Array | None:
         """Return the point of a link's shapes that is farthest from its origin, along the way to their middle."""
@@ -193,3 +222,7 @@ def _is_sensor(link: str) -> bool:
 
 def _is_tool(link: str) -> bool:
     return _has(link, _TOOLS) or bool(_list_words(link) & _TOOL_WORDS)
+
+
+def _is_tool_site(name: str) -> bool:
+    return _is_tool(name) or _has(name, (_GRIPPER, "pinch", "attachment"))

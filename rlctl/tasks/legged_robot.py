@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rlctl.errors import TaskError, UsageError
+from rlctl.task.mujoco.robot import read_keyframe
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.asked_motors import AskedMotors
 from rlctl.tasks.gait import Gait, describe_gait
@@ -145,24 +146,16 @@ def _slides(body: MujocoBody, joint: int) -> bool:
 
 def _find_keyframe(skeleton: Skeleton, legs: Sequence[Leg], longest: float) -> tuple[str, Stance | None]:
     """Return the keyframe `home` of an MJCF file, or its first, if it is a stance for legs of `longest` [m]."""
-    import mujoco
-
     body = skeleton.body
-    if body.file.suffix != ".xml":
+    name, pose = read_keyframe(body.file, body.joint_names)
+    if not set(body.joint_names) <= set(pose):
         return "", None
-    spec = mujoco.MjSpec.from_file(str(body.file))
-    keys = sorted(spec.keys, key=lambda key: str(key.name) != "home")  # the order of the others stays
-    sizes = {0: 7, 1: 4}  # free and ball joints
-    starts = np.cumsum([0, *(sizes.get(int(joint.type), 1) for joint in spec.joints)]).tolist()
-    places = [start for start, joint in zip(starts, spec.joints, strict=False) if int(joint.type) >= 2]
-    if not keys or len(keys[0].qpos) != starts[-1]:
-        return "", None
-    positions = np.asarray(keys[0].qpos, float)[places]
+    positions = np.array([pose[joint] for joint in body.joint_names])
     stance = measure_stance(skeleton, legs, positions)
     low, high = (factor * longest for factor in _KEYED)
     inside = (positions >= body.joint_low - _TINY) & (positions <= body.joint_high + _TINY)
     if inside.all() and low <= stance.leg_length <= high and stance.unevenness <= _LEVEL * longest:
-        return str(keys[0].name) or "0", stance
+        return name, stance
     return "", None
 
 

@@ -99,11 +99,12 @@ class _Arm:
     joints: list[str]  # that move the tip
     start: Any  # positions of all joints
     height: float  # [m], of the base above where the file has it
+    keyframe: str  # whose pose `start` is; empty if it was searched
     motors: AskedMotors | None
 
 
 def read_robot(model: str, link: str | None, motors: AskedMotors | None = None) -> StarterRobot:
-    """Read a user's URDF or MJCF file; `link` is the tip, by default that of `ArmModel.find_tip`.
+    """Read a user's URDF or MJCF file; `link`, or a site, is the tip, by default that of `ArmModel.find_tip`.
 
     It has real `motors`, or ideal ones.
 
@@ -120,14 +121,10 @@ def read_robot(model: str, link: str | None, motors: AskedMotors | None = None) 
     legs = "" if body.fixed else "; for a robot with legs add --walk"
     check_mounted(body, model, f"this makes a task for an arm that is mounted{legs}")
     arm = ArmModel(body)
-    name = link if link is not None else arm.find_tip()
-    check_name(name, [body.base_name, *body.link_names], f"--link: {path.name} has no link", UsageError)
-    joints = [body.joint_names[joint] for joint in arm.list_joints_to(name)]
-    if not joints:
-        raise UsageError(f"--link {name!r}: no joint moves it; choose another of: {', '.join(body.link_names)}")
-    tip = arm.choose_point(name)
-    start, height = _find_start(arm, tip)
-    described = _Arm(body, path, arm, tip, joints, start, height, motors)
+    tip = _find_tip(arm, link)
+    joints = [body.joint_names[joint] for joint in arm.list_joints_to(tip.link)]
+    start, height, keyframe = _find_start(arm, tip)
+    described = _Arm(body, path, arm, tip, joints, start, height, keyframe, motors)
     only_mujoco = motors is None and not reads_in_pybullet(path, body.joint_names)
     kept = {
         "point" if tip.point is not None else "origin": True,
@@ -143,6 +140,19 @@ def read_robot(model: str, link: str | None, motors: AskedMotors | None = None) 
     )
 
 
+def _find_tip(arm: ArmModel, asked: str | None) -> Tip:
+    """Return the tip of an arm, or that link or site; raises `UsageError` if there is none, or if it does not move."""
+    body, sites = arm.body, arm.list_sites()
+    name = asked if asked is not None else arm.find_tip()
+    links = [body.base_name, *body.link_names]
+    check_name(name, [*links, *sites], f"--link: {body.file.name} has no link or site", UsageError)
+    if name not in links:
+        return sites[name]
+    if not arm.list_joints_to(name):
+        raise UsageError(f"--link {name!r}: no joint moves it; choose another of: {', '.join(body.link_names)}")
+    return arm.choose_point(name)
+
+
 def check_mounted(body: MujocoBody, model: str, advice: str) -> None:
     """Raise `UsageError`, which ends in `advice`, for a body with a free base or without joints."""
     if not body.fixed:
@@ -153,11 +163,18 @@ def check_mounted(body: MujocoBody, model: str, advice: str) -> None:
 
 def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
     """Return what was chosen, a sentence a line."""
-    others = [name for name in arm.body.joint_names if name not in arm.joints]
-    tip = f"{arm.tip.link!r}" if arm.tip.point is None else f"the end of {arm.tip.link!r}"
-    lines = [f"{', '.join(arm.joints)} of {arm.path.name} bring {tip} to a goal"]
+    names = arm.body.joint_names
+    others = [name for name in names if name not in arm.joints]
+    lines = [f"{', '.join(arm.joints)} of {arm.path.name} bring {arm.tip} to a goal"]
+    still = [name for name in arm.joints if not arm.model.moves(arm.tip, [names.index(name)])]
+    if still:
+        lines.append(f"{', '.join(still)} cannot move it, and could be left out of JOINTS")
     if others:
         lines.append(f"START of {', '.join(others)} is kept")
+    if arm.keyframe:
+        lines.append(f"START is the keyframe {arm.keyframe!r} of the file")
+    if arm.motors is None and _has_actuators(arm.path):
+        lines.append("The file's actuators are not used: the task's act() drives the joints")
     if arm.height:
         lines.append(f"It is {arm.height:g} m above the floor, into which it hangs otherwise")
     if only_mujoco:
@@ -165,6 +182,12 @@ def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
     lines += list_faults(arm.body)
     lines.append("--link chooses another link; comments with CHANGE in task.py mark what to adapt")
     return ".\n".join(lines)
+
+
+def _has_actuators(path: Path) -> bool:
+    import mujoco
+
+    return path.suffix == ".xml" and len(mujoco.MjSpec.from_file(str(path)).actuators) > 0
 
 
 def list_faults(body: MujocoBody) -> list[str]:
@@ -252,28 +275,43 @@ def name_robot(model: Path) -> str:
     return model.stem.encode(errors="replace").decode()
 
 
-def _find_start(arm: ArmModel, tip: Tip) -> tuple[Any, float]:
-    """Return joint positions inside their limits, near 0 if possible, and how far the base must be raised [m].
+def _find_start(arm: ArmModel, tip: Tip) -> tuple[Any, float, str]:
+    """Return joint positions inside their limits, how far the base must be raised [m], and a keyframe's name.
 
-    The tip is above the floor, and no link that moves is in it. If there are no such positions the base is raised by
-    how far down the robot gets.
+    They are those of an MJCF file's keyframe, or near 0, or else any: the tip is above the floor, and no link that
+    moves is in it. If there are no such positions the base is raised by how far down the robot gets.
     """
     import numpy as np
 
     low, high = arm.find_range()
     rng = np.random.default_rng(0)
-    poses = [np.clip(0.0, low, high), (low + high) / 2, *(rng.uniform(low, high) for _ in range(_TRIES))]
+    keyframe, keyed = _read_keyframe(arm.body)
+    poses = [*keyed, np.clip(0.0, low, high), (low + high) / 2, *(rng.uniform(low, high) for _ in range(_TRIES))]
     shapes, has_plane, lowest = arm.list_moving_shapes(), arm.has_plane(), 0.0
-    for pose in poses:
+    for number, pose in enumerate(poses):
         pose = np.round(pose, 3) + 0.0  # no -0.0
         arm.body.set_joints(pose)
         tip_height, lowest_shape = float(arm.locate(tip)[2]), arm.find_lowest(shapes)
         if tip_height > _LOWEST_TIP and (has_plane or lowest_shape > -_IN_FLOOR):
-            return pose, 0.0
+            return pose, 0.0, keyframe if number < len(keyed) else ""
         lowest = min(lowest, tip_height, lowest_shape)
     if has_plane:
         raise UsageError(f"{arm.body.file.name}: {tip.link!r} is never above the floor, z = 0; choose another --link")
-    return np.round(poses[0], 3) + 0.0, math.ceil(100 * (_LOWEST_TIP - lowest)) / 100
+    return np.round(poses[0], 3) + 0.0, math.ceil(100 * (_LOWEST_TIP - lowest)) / 100, keyframe if keyed else ""
+
+
+def _read_keyframe(body: MujocoBody) -> tuple[str, list[Any]]:
+    """Return the name of an MJCF file's keyframe and the joint positions, if they are inside the limits."""
+    import numpy as np
+
+    from rlctl.task.mujoco.robot import read_keyframe
+
+    name, keyed = read_keyframe(body.file, body.joint_names)
+    if not set(body.joint_names) <= set(keyed):
+        return "", []
+    pose = np.array([keyed[joint] for joint in body.joint_names])
+    is_inside = bool(((body.joint_low <= pose) & (pose <= body.joint_high)).all())
+    return (name, [pose]) if is_inside else ("", [])
 
 
 def _limit_speeds(body: MujocoBody) -> tuple[list[float], str]:

@@ -128,6 +128,49 @@ def test_what_only_mujoco_reads_is_simulated_in_mujoco(tmp_path, monkeypatch):
         assert env.unwrapped.task.arm.joint_names == ["lift"]
 
 
+SITES = """<mujoco><compiler angle="radian"/><size nkey="1"/><visual><map znear="0.1"/></visual>
+<worldbody><body name="foot"><geom size="0.05"/><body name="one" pos="0 0 0.1">
+<joint name="lift" axis="0 1 0" range="-1 1"/><geom type="capsule" fromto="0 0 0 0 0 0.2" size="0.02"/>
+<body name="hand" pos="0 0 0.2"><joint name="wrist" axis="0 1 0" range="-1 1"/>
+<geom size="0.02" pos="0 0 0.05"/><site name="mark" pos="0.3 0 0"/>
+<site name="tcp" pos="0 0 0.1"/></body></body></body></worldbody><actuator><position joint="lift"/></actuator>
+<keyframe><key name="home" qpos="0.5 -0.25"/></keyframe></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "asked", "tip", "point"),
+    [
+        ("site-arm", None, "'tcp' of 'hand'", [0.0, 0.0, 0.1]),
+        ("mark-arm", "mark", "'mark' of 'hand'", [0.3, 0.0, 0.0]),
+    ],
+)
+def test_sites_and_keyframe_of_an_mjcf_file_are_used(name, asked, tip, point, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.xml").write_text(SITES)
+    plugin = new.create(name, model="arm.xml", link=asked)
+    lines = plugin.summary.split(".\n")
+    assert f"lift, wrist of arm.xml bring {tip} to a goal" in lines
+    assert "START is the keyframe 'home' of the file" in lines
+    assert "The file's actuators are not used: the task's act() drives the joints" in lines
+    with contextlib.closing(EnvSpec(plugin.target, sim=MUJOCO).make()) as env:
+        env.reset(seed=0)
+        task = env.unwrapped.task
+        start = type(task).draw_pose.__globals__["START"]
+        assert start == pytest.approx([0.5, -0.25])
+        task.arm.set_joints(np.zeros(2))
+        assert task.find_tip() == pytest.approx(np.array([0.0, 0.0, 0.3]) + point)
+    assert "Attach conflict" not in capfd.readouterr().err  # MuJoCo warns of <size> and <visual>
+
+
+def test_a_link_that_its_own_joint_only_turns_is_held_at_its_end(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, *ARM, link("flange"), joint("roll", "hand", "flange", axis="0 0 1"))
+    summary = new.create("end-arm", model="robot.urdf", link="hand").summary
+    assert "pan, lift, wrist of robot.urdf bring the end of 'hand' to a goal" in summary
+    summary = new.create("roll-arm", model="robot.urdf", link="flange").summary
+    assert "bring 'flange' to a goal.\nroll cannot move it, and could be left out of JOINTS" in summary
+
+
 def test_reach_is_measured_between_joints_not_origins(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "arm.xml").write_text(

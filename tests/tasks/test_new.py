@@ -246,7 +246,7 @@ def test_the_plugin_of_a_model_reads_well_and_passes_its_tests(model, tmp_path):
         ({"model": "plane.urdf"}, "--model plane.urdf: it has no joints; this makes a task for an arm"),
         (
             {"model": "given/arm.urdf", "link": "tool"},
-            "--link: arm.urdf has no link 'tool'. Did you mean 'tool_frame'?",
+            "--link: arm.urdf has no link or site 'tool'. Did you mean 'tool_frame'?",
         ),
         ({"model": "given/arm.urdf", "link": "base"}, "--link 'base': no joint moves it; choose another of: sled"),
         ({"link": "tip"}, "--link needs --model"),

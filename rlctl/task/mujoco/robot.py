@@ -67,7 +67,7 @@ def read_robot(path: Path) -> Robot:
     if body.fixed:
         raise UsageError(f"--model {path}: its base is fixed; add <freejoint/> to the body {body.base_name!r}")
     armature = body._sim.model.dof_armature[body.parts.velocities]
-    keyframe, pose = _read_keyframe(path, body.joint_names)
+    keyframe, pose = read_keyframe(path, body.joint_names)
     return Robot(
         path=path.resolve(),
         joints=tuple(body.joint_names),
@@ -122,8 +122,8 @@ def _list_motors(path: Path, joints: Sequence[str]) -> tuple[str, ...]:
     return moved if sorted(moved) == sorted(joints) else ()
 
 
-def _read_keyframe(path: Path, joints: Sequence[str]) -> tuple[str, dict[str, float]]:
-    """Return name and joint positions of the keyframe `home` of an MJCF file, or of its first."""
+def read_keyframe(path: Path, joints: Sequence[str]) -> tuple[str, dict[str, float]]:
+    """Return name and joint positions of the keyframe `home` of an MJCF file, or of its first; empty without one."""
     if path.suffix != ".xml":
         return "", {}
     import mujoco

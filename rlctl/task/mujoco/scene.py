@@ -24,6 +24,7 @@ _WXYZ = [3, 0, 1, 2]
 _WIDE = 5.0  # [m], of half a box
 _HIDDEN = 3  # group of geoms that neither pictures nor recordings show
 _GROUND_THICKNESS = 0.5  # [m], of rough ground
+_SIZES = ("memory", "nkey", "njmax", "nconmax", "nstack", "nemax", "nuserdata")  # of an MJCF file's <size>
 
 
 class MujocoScene:
@@ -88,9 +89,7 @@ class MujocoScene:
             # Only the pairs of `_add_pairs` collide.
             geom.contype = geom.conaffinity = 0
         frame = self.spec.worldbody.add_frame(pos=list(position), quat=[orientation[part] for part in _WXYZ])
-        for option in dir(self.spec.option):  # the file's are not used, and MuJoCo warns of them
-            if not option.startswith("_"):
-                setattr(child.option, option, getattr(self.spec.option, option))
+        self._replace_settings(child)
         self._attach(child, name, frame)
         if not fixed and is_urdf:
             self.spec.body(f"{name}/{parts.base_name}").add_freejoint(name=f"{name}/free")
@@ -172,6 +171,18 @@ class MujocoScene:
             spec.assets.clear()
         self.spec.attach(child, prefix=f"{name}/", frame=frame)
         self.spec.assets.update(in_memory)
+
+    def _replace_settings(self, child: Any) -> None:
+        """Give a file the settings of the world: its own are not used, and MuJoCo warns of those that differ."""
+        parts = [(child.option, self.spec.option)]
+        for name in _list_fields(self.spec.visual):
+            parts.append((getattr(child.visual, name), getattr(self.spec.visual, name)))
+        for own, new in parts:
+            for name in _list_fields(new):
+                setattr(own, name, getattr(new, name))
+        for name in _list_fields(self.spec):
+            if name in _SIZES or name.startswith("nuser_"):
+                setattr(child, name, getattr(self.spec, name))
 
     def _flatten_ground(self, child: Any) -> None:
         """Make a wide box that is fixed, such as the ground of `plane.urdf`, a plane: faster, and exact."""
@@ -272,3 +283,7 @@ def _keep_state(model: Any, data: Any, new_model: Any, new_data: Any) -> None:
         name = model.actuator(number).name
         new_data.actuator(name).ctrl[:] = data.actuator(name).ctrl
     new_data.time = data.time
+
+
+def _list_fields(settings: Any) -> list[str]:
+    return [name for name in dir(settings) if not name.startswith("_")]
