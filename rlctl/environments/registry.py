@@ -24,6 +24,8 @@ from rlctl.environments.places import describe_exception_place
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, did_you_mean
 from rlctl.storage import files
 
+PRESETS = Path(__file__).parents[1] / "recipe" / "presets"
+"""Preset recipes: `--config presets/NAME`."""
 _MOST_NAMED = 4  # classes of a file
 _GYMNASIUM_ID = re.compile(r"^(?!.*\.py:)(?:(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+|[\w.]+:[\w.-]+/[\w.-]+)$")
 """An id with a version, or one of a module with a namespace, as `metaworld:Meta-World/MT1`: no class has that form."""
@@ -88,9 +90,15 @@ def is_gymnasium_id(task: str) -> bool:
 
 
 def find_recipe_file(task: str) -> Path | None:
-    """Return the recipe that comes with a task: `<name>.yaml` next to its module, or `<file>.yaml` next to its file."""
+    """Return the recipe that comes with a task: `<name>.yaml` next to its module, or `<file>.yaml` next to its file.
+
+    That of a Gymnasium id is the preset of its name, such as `presets/ant-v5`.
+    """
     if entry := installed.find(task):
         return entry.recipe_file
+    if _GYMNASIUM_ID.match(task):
+        preset = PRESETS / f"{task.lower()}.yaml"
+        return preset if preset.is_file() else None
     file = find_source_file(task)
     recipe = file.with_suffix(".yaml") if file else None
     return recipe if recipe and recipe.is_file() else None

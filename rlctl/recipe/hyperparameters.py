@@ -9,6 +9,8 @@ from pydantic import Field
 
 from rlctl.storage.validation import Number, NumberAfter, Section, Switch, Whole
 
+LINEAR = "lin_"
+"""Before the first value of a schedule that falls linearly to zero: `lin_3e-4`."""
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
 
 _Fraction = Annotated[Number, Field(ge=0, le=1)]
@@ -20,10 +22,16 @@ _Count = Annotated[Whole, Field(ge=1, le=10**9)]
 _CountFrom0 = Annotated[Whole, Field(ge=0, le=10**9)]
 _Minibatch = Annotated[Whole, Field(ge=2, le=10**9)]
 
-_Schedule = _PositiveFraction | Annotated[str, NumberAfter("lin_", _PositiveFraction)]
-_ClipSchedule = _ClipRange | Annotated[str, NumberAfter("lin_", _ClipRange)]
-_PositiveSchedule = _Positive | Annotated[str, NumberAfter("lin_", _Positive)]
+_Schedule = _PositiveFraction | Annotated[str, NumberAfter(LINEAR, _PositiveFraction)]
+_ClipSchedule = _ClipRange | Annotated[str, NumberAfter(LINEAR, _ClipRange)]
+_PositiveSchedule = _Positive | Annotated[str, NumberAfter(LINEAR, _Positive)]
 _EntropyCoefficient = _NotNegative | Literal["auto"] | Annotated[str, NumberAfter("auto_", _Positive)]
+
+
+def split_schedule(value: float | str) -> tuple[float, bool]:
+    """Return the value at the beginning of the training, and whether it falls linearly to zero."""
+    text = str(value)
+    return float(text.removeprefix(LINEAR)), text.startswith(LINEAR)
 
 
 def decide_by(rule: str) -> dict[str, Any]:

@@ -14,8 +14,6 @@ from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import WITH_PRIVILEGED, NormalizeSettings, Recipe, Source, validate
 from rlctl.storage import yaml_text
 
-_PRESETS = Path(__file__).with_name("presets")
-"""Preset recipes: `--config presets/NAME`."""
 _DEEPEST_KEY = 20
 _FEWEST_EVALUATIONS = 5
 _WITH_UNIT = re.compile(r"([\d.]+)([kKmM])")
@@ -171,7 +169,7 @@ def read(path: Path) -> dict[str, Any]:
 
 def list_presets() -> dict[str, Path]:
     """Return the presets of `--config`: name (`presets/ppo`) and file."""
-    return {f"{_PRESETS.name}/{file.stem}": file for file in sorted(_PRESETS.glob("*.yaml"))}
+    return {f"{registry.PRESETS.name}/{file.stem}": file for file in sorted(registry.PRESETS.glob("*.yaml"))}
 
 
 def find_config(config: Path) -> Path:
@@ -179,9 +177,9 @@ def find_config(config: Path) -> Path:
 
     Raises `ArtifactError` for a preset that does not exist.
     """
-    if config.exists() or len(config.parts) != 2 or config.parts[0] != _PRESETS.name or config.suffix:
+    if config.exists() or len(config.parts) != 2 or config.parts[0] != registry.PRESETS.name or config.suffix:
         return config
-    file = _PRESETS / f"{config.name}.yaml"
+    file = registry.PRESETS / f"{config.name}.yaml"
     check_name(str(config), list_presets(), "no preset", ArtifactError, listed="Presets")
     return file
 

@@ -18,6 +18,7 @@ from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
 from rlctl.play.workers import Workers
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
+from rlctl.recipe.hyperparameters import LINEAR, split_schedule
 from rlctl.recipe.recipe import ON_POLICY, NormalizeSettings, Recipe
 from rlctl.storage.untrusted import measure_free_memory
 from rlctl.task.mirror import ACTION, join_places
@@ -173,9 +174,9 @@ def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
 
 def _make_schedule(value: Any) -> Any:
     """Return a schedule that falls linearly to zero for rl-zoo's `lin_3e-4`; other values unchanged."""
-    if not isinstance(value, str) or not value.startswith("lin_"):
+    if not isinstance(value, str) or not value.startswith(LINEAR):
         return value
-    start = float(value.removeprefix("lin_"))
+    start, _ = split_schedule(value)
     # The last rollout may pass the end, where the rate would be negative.
     return lambda remaining: max(remaining, 0.0) * start
 

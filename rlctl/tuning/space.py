@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.spec import merge
 from rlctl.errors import UsageError
-from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, ON_POLICY
+from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, LINEAR, ON_POLICY, split_schedule
 from rlctl.recipe.recipe import Recipe
 from rlctl.storage import yaml_text
 
@@ -133,10 +133,9 @@ def fill_parameters(recipe: Recipe) -> dict[str, Any]:
 
 
 def _vary_learning_rate(value: Any) -> Dimension:
-    prefix = "lin_" if str(value).startswith("lin_") else ""
-    rate = float(str(value).removeprefix(prefix))
+    rate, falls = split_schedule(value)
     low, high = (float(f"{bound:.{_DIGITS}g}") for bound in (rate / 10, min(10 * rate, 1.0)))
-    return Dimension("algo_kwargs.learning_rate", low=low, high=high, prefix=prefix)
+    return Dimension("algo_kwargs.learning_rate", low=low, high=high, prefix=LINEAR if falls else "")
 
 
 def _vary_batches(recipe: Recipe, parameters: Mapping[str, Any]) -> list[Dimension]:

@@ -30,6 +30,12 @@ def test_the_example_of_the_page_about_mujoco():
     assert (made.algo, made.total_timesteps) == ("ppo", 400_000)
 
 
+def test_a_gymnasium_id_has_the_preset_of_its_name():
+    assert sources.resolve("Reacher-v5", None, {}) == sources.resolve("Reacher-v5", Path("presets/reacher-v5"), {})
+    assert sources.resolve("Reacher-v5", Path("presets/sac"), {}).algo == "sac"
+    assert sources.resolve("Pendulum-v1", None, {}) == sources.resolve("CartPole-v1", None, {})  # nobody's preset
+
+
 def test_a_preset_that_is_not_there():
     with pytest.raises(ArtifactError) as caught:
         sources.resolve("reach", Path("presets/pppo"), {})
