@@ -4,6 +4,7 @@ A task is written as an installed name (`reach`), `package.module:Class`, `path/
 (`Pendulum-v1`, `package:Env-v0`).
 """
 
+import contextlib
 import importlib
 import importlib.util
 import inspect
@@ -11,7 +12,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -204,29 +205,46 @@ def _load_gymnasium(task: str) -> Callable[..., Any]:
             import_module(task, module)  # as in `load`: report exceptions of the import separately
 
     def constructor(**parameters: Any) -> Any:
-        try:
+        with _explain_unregistered(task):
             return gymnasium.make(task, disable_env_checker=True, **parameters)
-        except gymnasium.error.UnregisteredEnv:
-            name = task.rpartition(":")[2]
-            old = getattr(sys.modules.get("gym"), "envs", None)  # imported, so an id may be registered there
-            registry = getattr(old, "registry", {})
-            if name in getattr(registry, "env_specs", registry):
-                known = f"{name} is registered with the old gym package"
-                raise OldGymError(f"{known}; Gymnasium cannot find it there") from None
-            if module := own_ids.find_registering_module(task):
-                raise _name_module(task, module) from None
-            forms = "" if ":" in task else f" If a package registers it, write PACKAGE:{task}."
-            close = did_you_mean(name, gymnasium.registry)
-            raise UsageError(f"Gymnasium has no environment {task!r}.{close}{forms}") from None
-        except (gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
-            missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)
-            if missing and missing != task.partition(":")[0]:
-                raise  # the module exists, but one of its own imports does not
-            advice = missing_packages.advise_on(missing or "")
-            raise UsageError(f"Gymnasium: {task}: {str(error).rstrip('.')}{advice}") from None
 
     constructor.gymnasium_id = task  # type: ignore[attr-defined]
     return constructor
+
+
+def check_registered(constructor: Callable[..., Any]) -> None:
+    """Raise `UsageError` if this is the constructor of an id that Gymnasium does not know; nothing is built."""
+    import gymnasium
+
+    if (task := getattr(constructor, "gymnasium_id", None)) is not None:
+        with _explain_unregistered(task):
+            gymnasium.spec(task)
+
+
+@contextlib.contextmanager
+def _explain_unregistered(task: str) -> Iterator[None]:
+    import gymnasium
+
+    try:
+        yield
+    except gymnasium.error.UnregisteredEnv:
+        name = task.rpartition(":")[2]
+        old = getattr(sys.modules.get("gym"), "envs", None)  # imported, so an id may be registered there
+        registry = getattr(old, "registry", {})
+        if name in getattr(registry, "env_specs", registry):
+            known = f"{name} is registered with the old gym package"
+            raise OldGymError(f"{known}; Gymnasium cannot find it there") from None
+        if module := own_ids.find_registering_module(task):
+            raise _name_module(task, module) from None
+        forms = "" if ":" in task else f" If a package registers it, write PACKAGE:{task}."
+        close = did_you_mean(name, gymnasium.registry)
+        raise UsageError(f"Gymnasium has no environment {task!r}.{close}{forms}") from None
+    except (gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
+        missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)
+        if missing and missing != task.partition(":")[0]:
+            raise  # the module exists, but one of its own imports does not
+        advice = missing_packages.advise_on(missing or "")
+        raise UsageError(f"Gymnasium: {task}: {str(error).rstrip('.')}{advice}") from None
 
 
 def _name_module(task: str, module: str) -> UsageError:

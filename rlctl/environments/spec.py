@@ -314,6 +314,14 @@ EpisodeSpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.EPISODE)), P
 """The `EnvSpec` in a recorded episode."""
 
 
+def check_given(task: str, constructor: Any, values: Mapping[str, Any]) -> None:
+    """Raise `RecipeError` for parameters that a task or an environment does not have; nothing is built."""
+    if is_task(constructor):
+        check_fields(constructor, values)
+    else:
+        check_keywords(task, constructor, values)
+
+
 def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
     """Raise `RecipeError` if a plain environment's constructor has no parameter of that name."""
     known = read_parameters(constructor) if parameters else None

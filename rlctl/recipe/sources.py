@@ -8,7 +8,7 @@ from typing import Any
 
 from rlctl.engine import Engine
 from rlctl.environments import registry
-from rlctl.environments.spec import EnvChanges, EnvSpec, merge
+from rlctl.environments.spec import EnvChanges, EnvSpec, check_given, merge
 from rlctl.errors import ArtifactError, RecipeError, check_name, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import WITH_PRIVILEGED, NormalizeSettings, Recipe, Source, validate
@@ -107,9 +107,15 @@ def describe_other_algorithm(task: str, config: Path | None, settings: Mapping[s
 
 
 def resolve_with_stages(task: str, config: Path | None = None, settings: Mapping[str, Any] | None = None) -> Recipe:
-    """Resolve a recipe, including the stages that the task's class declares; the task is imported."""
+    """Resolve a recipe, including the stages that the task's class declares; the task is imported, and not built.
+
+    Raises `UsageError` for an id that Gymnasium does not know, `RecipeError` for parameters that the task lacks.
+    """
     constructor: Any = registry.load(task)
-    return resolve(task, config, settings or {}, constructor.stages if registry.is_task(constructor) else ())
+    registry.check_registered(constructor)
+    recipe = resolve(task, config, settings or {}, constructor.stages if registry.is_task(constructor) else ())
+    check_given(task, constructor, recipe.task)
+    return recipe
 
 
 def make_spec(task: str, parameters: Mapping[str, Any] | None = None) -> EnvSpec:

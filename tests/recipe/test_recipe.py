@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
-from rlctl.errors import ArtifactError, RecipeError
+from rlctl.errors import ArtifactError, RecipeError, RlctlError
 from rlctl.recipe import recipe, sources
 from rlctl.recipe.recipe import Recipe, validate
 from rlctl.recipe.sources import parse_changes, parse_settings, resolve
@@ -329,3 +329,17 @@ def test_command_shows_the_merged_recipe(rlctl, config):
     assert done.stdout == expected.to_yaml()
     assert "is for ppo; not used for sac: algo_kwargs, policy_kwargs; used: total_timesteps 120000" in done.stderr
     assert rlctl("recipe", "reach", "--algo", "sacc").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("task", "parameters", "message"),
+    [
+        ("Pendlum-v1", {}, "Gymnasium has no environment 'Pendlum-v1'. Did you mean 'Pendulum-v1'?"),
+        ("reach", {"tolerence": 0.1}, "task.tolerence: Reach has no parameter 'tolerence'. Did you mean 'tolerance'?"),
+        ("CartPole-v1", {"suton": 1}, "task.suton: CartPole-v1 has no parameter 'suton'."),
+    ],
+)
+def test_names_are_checked_before_anything_is_built(task, parameters, message):
+    with pytest.raises(RlctlError) as caught:
+        sources.resolve_with_stages(task, None, {"task": parameters})
+    assert str(caught.value).startswith(message)
