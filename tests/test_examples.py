@@ -61,8 +61,7 @@ def test_bare_env_is_clean(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_reacher_of_mujoco_trains(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
-    preset = "presets/reacher-v5"
-    rlctl("train", "Reacher-v5", "--config", preset, "-n", "1600", "--set", "eval.episodes=2", cwd=tmp_path)
+    rlctl("train", "Reacher-v5", "-n", "1600", "--set", "eval.episodes=2", cwd=tmp_path)
 
 
 @pytest.mark.slow
