@@ -132,6 +132,17 @@ class Body:
         """
         self._refuse("joint_reaction")
 
+    def add_contact_sensor(self, link: str) -> None:
+        """Measure whether a link touches anything; `touches` reads it. Call it in `build`."""
+        self._refuse("add_contact_sensor")
+
+    def touches(self, link: str) -> NDArray[np.bool_]:
+        """Return whether a link touches another body, or another link of its own, shape ().
+
+        It needs `add_contact_sensor`. PyBullet tells it of the last physics step.
+        """
+        self._refuse("touches")
+
     def solve_inverse_kinematics(
         self, link: str, position: Sequence[float] | Array, orientation: Sequence[float] | Array | None = None
     ) -> Array:

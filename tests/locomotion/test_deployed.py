@@ -18,7 +18,15 @@ from rlctl.task.motion import MotionClip, write_motion
 from rlctl.task.mujoco.robot import read_robot
 from rlctl_robot.diagnose.deployed import diagnose_deployment
 from rlctl_robot.diagnose.mapped_actor import map_action, map_observation
-from tests.importing.foreign.policies import A1, describe_walk, expect_as, read_walk, write_onnx, write_yaml
+from tests.importing.foreign.policies import (
+    A1,
+    describe_walk,
+    expect_as,
+    read_walk,
+    write_onnx,
+    write_scene,
+    write_yaml,
+)
 
 FOREIGN = {
     "observations": [
@@ -88,6 +96,39 @@ def test_wheels_follow_speeds():
     # The damper of 1 N m s/rad pushes towards 0.25 * 4 = 1 rad/s.
     assert 0.2 < observation[0, 2] < 1.5
     worlds.close()
+
+
+def test_what_a_robot_with_sensors_observes(tmp_path):
+    observations = [
+        {"kind": "accelerometer", "shift": [1.3, 0.0, 0.0]},
+        {"kind": "constant", "values": [0.0, 0.0]},  # part of the network's input only
+        {"kind": "last_action", "history": 2},
+        {"kind": "targets", "relative": False},
+        {"kind": "contacts", "links": ["left", "right"]},
+    ]
+    deployment = {
+        "joints": ["right_hip", "left_hip"],
+        "default_positions": [0.1, -0.1],
+        "action_scale": [0.25] * 2,
+        "stiffness": [20.0] * 2,
+        "damping": [1.0] * 2,
+        "target_speed": [5.0, 1e3],
+        "control_dt": 0.02,
+        "observations": observations,
+        "start_height": 0.16,
+    }
+    spec = EnvSpec(TASK, {"deployment": deployment, "robot_file": write_scene(tmp_path)})
+    with contextlib.closing(spec.make_worlds(2)) as worlds:
+        first = worlds.reset(np.arange(2), [0, 1])
+        assert first.shape == (2, 3 + 2 * 2 + 2 + 2)
+        assert first[0] == pytest.approx([1.3, 0.0, 9.81, 0.0, 0.0, 0.0, 0.0, 0.1, -0.1, 0.0, 0.0])
+        # 0.25 * 2 rad are wanted; the target of the right hip moves by 5 rad/s * 0.02 s.
+        second = worlds.step(np.full((2, 2), 2.0, np.float32)).observation
+        assert second[0, 3:9] == pytest.approx([0.0, 0.0, 2.0, 2.0, 0.1 + 0.1, -0.1 + 0.5])
+        for _ in range(100):
+            last = worlds.step(np.array([[0.0, 0.0], [-0.4, 0.4]], np.float32)).observation
+    assert last[0, :3] == pytest.approx([1.3, 0.0, 9.81], abs=0.3)
+    assert last[:, 9:].tolist() == [[1.0, 1.0], [1.0, 1.0]]
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from rlctl.task.deployment import MOTION, Deployment
 from rlctl.task.motion import MotionClip
 from rlctl.task.mujoco.robot import Robot
 
-_OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature")
+_OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature", "target_speed")
 _REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")
 _USUAL_COMMANDS = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.5, 0.5]}
 _USUAL_ANCHOR = "torso_link"  # of Unitree's G1, with which whole_body_tracking and mjlab train
@@ -73,6 +73,7 @@ class Draft:
                 turn = clip.root_orientation[0].tolist()
             values["start_height"] = round(robot.measure_start(pose, turn), 4)
         deployment = validation.build(Deployment, values, UsageError, self.source)
+        self._check_parts(deployment, robot)
         self._check_sizes(deployment, network)
         self._check_motion(deployment, clip)
         return deployment
@@ -137,6 +138,19 @@ class Draft:
             )
         if clip is not None and not deployment.follows_motion:
             raise UsageError(f"{self.source}: the policy observes no clip; leave out --motion {clip.name}")
+
+    def _check_parts(self, deployment: Deployment, robot: Robot) -> None:
+        """Raise `UsageError` for links and sensors that are observed and that the robot does not have."""
+        for part in deployment.observations:
+            for link in part.links:
+                check_name(link, robot.links, f"{self.source}: {robot.path.name} has no link", UsageError)
+            if part.kind == "accelerometer" and not robot.sensors:
+                raise UsageError(
+                    f"{self.source}: observes an accelerometer, and {robot.path.name} has no sensors; give an MJCF "
+                    "file with <accelerometer>"
+                )
+            if part.kind == "accelerometer":
+                check_name(part.sensor, robot.sensors, f"{self.source}: {robot.path.name} has no sensor", UsageError)
 
     def _check_sizes(self, deployment: Deployment, network: ForeignNetwork) -> None:
         if len(deployment.joints) != network.action_size:

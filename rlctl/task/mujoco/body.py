@@ -161,6 +161,20 @@ class MujocoBody(MujocoMotors):
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build") from None
         return np.concatenate(halves, axis=-1)
 
+    def add_contact_sensor(self, link: str) -> None:
+        self.find_link(link)
+        self._sim.add_contact_sensor(f"{self.name}/{link}")
+
+    def touches(self, link: str) -> NDArray[np.bool_]:
+        try:
+            found = self._fields.sensor(f"{self.name}/{link} contacts")
+        except KeyError:
+            raise TaskError(
+                f"link {link!r} has no contact sensor: call add_contact_sensor({link!r}) in build"
+            ) from None
+        touching: NDArray[np.bool_] = found[..., 0] > 0
+        return touching
+
     def sensor(self, name: str) -> Array:
         check_name(name, self.sensor_names, f"{self.file.name} has no sensor", TaskError)
         return self._fields.sensor(f"{self.name}/{name}")

@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.importing.foreign.import_policy import import_policy, import_to_play
@@ -24,6 +25,7 @@ from tests.importing.foreign.policies import (
     expect_as,
     read_walk,
     write_onnx,
+    write_scene,
     write_torchscript,
     write_yaml,
 )
@@ -358,6 +360,68 @@ def test_tags_of_python_are_not_constructed(run_import, tmp_path):
     deploy = tmp_path / "deploy.yaml"
     imported = import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1), output=tmp_path / "a.safetensors")
     assert imported.deployment.control_dt == 0.02
+
+
+DUCK = {  # as Open Duck's policies, of a smaller robot
+    "action_scale": 0.25,
+    "target_speed": 5.24,
+    "control_dt": 0.02,
+    "observations": [
+        {"kind": "gyroscope"},
+        {"kind": "accelerometer", "shift": [1.3, 0.0, 0.0]},
+        {"kind": "command"},
+        {"kind": "constant", "values": [0.5, -0.5], "scale": 2.0},
+        {"kind": "joint_positions"},
+        {"kind": "last_action", "history": 3},
+        {"kind": "targets", "relative": False},
+        {"kind": "contacts", "links": ["left", "right"]},
+    ],
+    "newest_first": True,
+    "commands": {"lin_vel_x": [-0.15, 0.15], "lin_vel_y": [-0.2, 0.2]},
+}
+
+
+def test_constants_become_part_of_the_network(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    size = 3 + 3 + 3 + 2 + 2 + 6 + 2 + 2
+    module = write_torchscript(tmp_path / "policy.pt", [size, 8, 2])
+    deploy = write_yaml(tmp_path / "deploy.yaml", DUCK)
+    imported = import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, write_scene(tmp_path)))
+    # Half of the fastest command, of 0.25 m/s.
+    assert imported.policy.info.spec.parameters["tolerance"] == 0.125
+    deployment = imported.deployment
+    assert (deployment.default_positions, deployment.target_speed) == ((0.0, 0.0), (5.24, 5.24))
+    seen = np.linspace(-1.0, 1.0, size - 2).astype(np.float32)  # rlctl's layout: the oldest action first
+    own = np.concatenate([seen[:9], [1.0, -1.0], seen[9:11], seen[15:17], seen[13:15], seen[11:13], seen[17:]])
+    expected = module(torch.tensor(own[None], dtype=torch.float32)).detach().numpy()[0]
+    acted = load_policy(imported.policy.path).predict(seen)
+    assert acted == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "contacts", "links": ["lefd"]}, r"scene\.xml has no link 'lefd'. Did you mean 'left'"),
+        ({"kind": "accelerometer", "sensor": "acc"}, r"scene\.xml has no sensor 'acc'"),
+        ({"kind": "constant"}, "observation 'constant' has no values"),
+        ({"kind": "phase", "period_s": 1.0, "shift": 1.0}, "observation 'phase' cannot be shifted"),
+    ],
+)
+def test_sensors_that_the_robot_lacks(tmp_path, changes, message):
+    write_torchscript(tmp_path / "policy.pt", [5, 8, 2])
+    content = {**DUCK, "observations": [{"kind": "joint_positions"}, changes]}
+    deploy = write_yaml(tmp_path / "deploy.yaml", content)
+    with pytest.raises(UsageError, match=message) as raised:
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, write_scene(tmp_path)))
+    assert str(raised.value).count("\n") < 3
+
+
+def test_an_accelerometer_needs_mjcf(tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [3, 8, 12])
+    content = describe_walk(observations=[{"kind": "accelerometer"}])
+    deploy = write_yaml(tmp_path / "deploy.yaml", content)
+    with pytest.raises(UsageError, match=r"a1\.urdf has no sensors; give an MJCF file with <accelerometer>"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1))
 
 
 def test_anchors_and_large_files_are_refused(tmp_path):
