@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.task import Body, Box, Event, Joints, Sim, TaskError
+from rlctl.task import Body, Box, Event, Joints, Sim, TaskError, WorldRngs
 from rlctl.task.deployment import COMMANDS, NOT_TRAINED, ORIENTATION, USUAL_TOLERANCE, Deployment, ObservedPart
-from rlctl.task.rotations import rotate_inverse
+from rlctl.task.reference import find_heading
+from rlctl.task.rotations import rotate, rotate_inverse
 from rlctl_locomotion.walk import Walk
 
 NOISE = {  # events of observations
@@ -23,7 +24,10 @@ UNITS = {
     "accelerometer": "m/s^2",
     "contacts": "1: touches something, 0: does not",
     "targets": "rad",
+    "heights": "m",
 }
+AROUND = np.stack(np.meshgrid(np.linspace(-1.3, 1.3, 9), np.linspace(-1.3, 1.3, 9)), -1).reshape(-1, 2)
+"""Where the ground is looked at before a start, from the trunk, in units of its height."""
 AT_REST = np.array([0.0, 0.0, 9.81])  # [m/s^2], what an accelerometer measures
 OTHER_STIFFNESS, OTHER_DAMPING, OTHER_ARMATURE = 100.0, 2.0, 0.01  # of joints that the policy does not move
 ENDLESS = 1e6  # [N m], of joints without a limit
@@ -177,12 +181,36 @@ class Deployed(Walk):
             return self.last_action
         if part.kind == "targets":
             return self.stance[self.joints] + self.commanded
+        if part.kind == "heights":
+            return self._scan_heights()
         if part.kind == "contacts":
             return np.stack([self.body.touches(link) for link in part.links], axis=-1).astype(float)
         if part.kind == "accelerometer":
             at_rest = rotate_inverse(self.orientation, AT_REST)
             return np.where(self.steps[:, None] == 0, at_rest, self.body.sensor(part.sensor))
         return (self.steps * self.control_dt)[:, None]  # of the clock
+
+    def _scan_heights(self) -> np.ndarray:
+        """Return how far the ground is below the trunk's frame [m], at the points of the scan."""
+        scan = self.described.scan
+        assert scan is not None
+        place = self.body.link_position(self.body.base_name)[:, None]
+        around = rotate(find_heading(self.orientation)[:, None], np.pad(scan.points, ((0, 0), (0, 1))))
+        return place[..., 2] - self.ground.surface_heights((place + around)[..., :2])
+
+    def draw_place(self, rng: WorldRngs, worlds: np.ndarray) -> np.ndarray:
+        """Return where the trunk starts [m], shape (k, 3): above the highest ground near it."""
+        place = super().draw_place(rng, worlds)
+        if self.terrain:
+            place[:, 2] += self.ground.surface_heights(place[:, None, :2] + self.start_height * AROUND).max(axis=1)
+        return place
+
+    def measure_height(self) -> np.ndarray:
+        """Return the height of the trunk above the ground [m]."""
+        position = self.body.base_position
+        if not self.terrain:
+            return position[:, 2]
+        return position[:, 2] - self.ground.surface_heights(position[:, :2])
 
     def _turn(self, vector: np.ndarray, part: ObservedPart) -> np.ndarray:
         return vector if part.frame == "world" else rotate_inverse(self.orientation, vector)

@@ -181,6 +181,13 @@ class Body:
         """Return the points where this body touches `other`, at the last physics step."""
         self._refuse("contacts_with")
 
+    def surface_heights(self, places: Array) -> Array:
+        """Return the heights of this body's top [m] at `places` [m], world frame, shape (..., 2) to (...).
+
+        For ground: the body stands where it was built. Where it has no surface the height is 0.
+        """
+        self._refuse("surface_heights")
+
     def distance_to(self, other: Any, link: str | None = None) -> float:
         """Return the shortest distance [m] between the collision shapes of two bodies, negative where they overlap.
 

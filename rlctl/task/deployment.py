@@ -30,6 +30,7 @@ Kind = Literal[
     "contacts",
     "targets",
     "constant",
+    "heights",
 ]
 TASK = "rlctl_locomotion.deployed:Deployed"
 """The task that plays deployed policies which follow velocity commands."""
@@ -51,7 +52,16 @@ MOTION = ("motion", "anchor_orientation")
 RELATIVE = ("joint_positions", "targets")
 """Observations that may be from the default positions."""
 _OF_JOINTS = ("joint_positions", "joint_velocities", "last_action", "targets")
-_MEASURED = ("gyroscope", "velocity", "accelerometer", "joint_positions", "joint_velocities", "targets", "contacts")
+_MEASURED = (
+    "gyroscope",
+    "velocity",
+    "accelerometer",
+    "joint_positions",
+    "joint_velocities",
+    "targets",
+    "contacts",
+    "heights",
+)
 """What is observed as it is measured, shifted and clipped."""
 _Number = Annotated[float, pydantic.AllowInfNan(False)]
 _Numbers = tuple[_Number, ...]
@@ -75,6 +85,20 @@ class ObservedPart(pydantic.BaseModel, extra="forbid", frozen=True):
     links: tuple[str, ...] = ()  # of `contacts`: 1 for each that touches something, else 0
     sensor: str = "accelerometer"  # of `accelerometer`: its name in the MJCF file
     values: _Numbers = ()  # of `constant`: what the policy always gets, such as a command that nobody gives
+
+
+class HeightScan(pydantic.BaseModel, extra="forbid", frozen=True):
+    """A grid of points around the robot, whose x axis points forwards; without roll and pitch."""
+
+    x: _Numbers = pydantic.Field(min_length=1)  # [m], forwards
+    y: _Numbers = pydantic.Field(min_length=1)  # [m], to the left
+    x_first: bool = True  # x changes from one point to the next, as in Isaac Lab; otherwise y, as in legged_gym
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """The points in the policy's order [m], shape (points, 2)."""
+        along, across = np.meshgrid(self.x, self.y, indexing="xy" if self.x_first else "ij")
+        return np.column_stack([along.ravel(), across.ravel()])
 
 
 class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
@@ -101,6 +125,7 @@ class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
     commands: Mapping[str, tuple[_Number, _Number]] = {}
     """Lowest and highest command by name, one of `COMMANDS` [m/s, m/s, rad/s]; one that is left out is 0."""
     start_height: float = pydantic.Field(gt=0)  # [m], of the trunk's centre of mass
+    scan: HeightScan | None = None  # where `heights` are observed
     anchor: str = ""  # link whose orientation a clip has; empty: the base
 
     @pydantic.model_validator(mode="after")
@@ -150,6 +175,8 @@ class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
             raise ValueError(f"observation {part.kind!r} cannot be shifted")
         if isinstance(part.shift, tuple) and len(part.shift) != size:
             raise ValueError(f"observation {part.kind!r} has {len(part.shift)} shifts for {size} elements")
+        if part.kind == "heights" and self.scan is None:
+            raise ValueError("observation 'heights' needs scan, such as {x: [-0.1, 0, 0.1], y: [-0.1, 0, 0.1]} [m]")
         if part.kind == "contacts" and not part.links:
             raise ValueError("observation 'contacts' has no links")
         if part.kind == "constant" and not part.values:
@@ -163,6 +190,8 @@ class Deployment(pydantic.BaseModel, extra="forbid", frozen=True):
             return len(part.links)
         if part.kind == "constant":
             return len(part.values)
+        if part.kind == "heights":
+            return 0 if self.scan is None else len(self.scan.points)
         if part.kind == "motion":
             return 2 * len(self.joints)
         if part.kind == "anchor_orientation":

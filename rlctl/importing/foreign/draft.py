@@ -18,6 +18,10 @@ from rlctl.task.mujoco.robot import Robot
 _OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature", "target_speed")
 _REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")
 _USUAL_COMMANDS = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.5, 0.5]}
+_USUAL_SCAN = {
+    "x": [round(0.1 * number, 1) for number in range(-8, 9)],
+    "y": [round(0.1 * number, 1) for number in range(-5, 6)],
+}
 _USUAL_ANCHOR = "torso_link"  # of Unitree's G1, with which whole_body_tracking and mjlab train
 _USUAL_ARMATURE = 0.01  # [kg m^2], of motors and gears of walking robots
 _FORMS = {
@@ -109,6 +113,9 @@ class Draft:
         kinds = [part.get("kind") for part in observed if isinstance(part, dict)]
         if "anchor_orientation" in kinds:
             self._guess_anchor(values, robot)
+        if "heights" in kinds and values.get("scan") is None:
+            values["scan"] = _USUAL_SCAN
+            self.notes.append("scan: guessed 17 x 11 points, 0.1 m apart, as in Isaac Lab's velocity tasks")
         if not values.get("commands") and not set(kinds) & set(MOTION):
             values["commands"] = _USUAL_COMMANDS
             ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in _USUAL_COMMANDS.items())

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import itertools
+import pathlib
 import re
 
 import numpy as np
@@ -108,6 +109,17 @@ def test_deploy_yaml_of_unitree_rl_lab_has_two_orders(run_import):
     assert "joint_ids_map: guessed the order FR, FL, RR, RL of Unitree's quadrupeds" in imported.notes
 
 
+def test_height_scan_of_isaac_lab(run_import):
+    observations = {**LAB["observations"], "height_scan": {"scale": [5.0] * 187, "clip": [-1.0, 1.0]}}
+    imported = run_import({**LAB, "observations": observations}, 48 + 187)
+    heights = imported.deployment.observations[-1]
+    assert (heights.kind, heights.shift, heights.clip, heights.scale) == ("heights", -0.5, (-1.0, 1.0), 5.0)
+    assert "scan: guessed 17 x 11 points, 0.1 m apart, as in Isaac Lab's velocity tasks" in imported.notes
+    pathlib.Path(imported.policy.path).unlink()
+    with pytest.raises(UsageError, match=r"heights 187\), and the network takes 148"):
+        run_import({**LAB, "observations": observations}, 148, name="other.yaml")
+
+
 def test_stiffness_follows_joint_ids_map(run_import):
     order = [3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]
     deployment = run_import({**LAB, "joint_ids_map": order}, 48).deployment
@@ -202,7 +214,7 @@ def test_columns_of_histories():
         (GYM, 47, {"stifness": 1}, "a deployment has no 'stifness'. Did you mean 'stiffness'"),
         (LAB | {"observations": {"motion_command": {}}}, 24, None, "give the one it was trained with: --motion FILE"),
         (LAB | {"observations": {"motion_anchor_pos_b": {}}}, 48, None, "observes motion_anchor_pos_b, which is not"),
-        (LAB | {"observations": {"height_scan": {}}}, 48, None, "no known observation is 'height_scan'"),
+        (LAB | {"observations": {"hight_scan": {}}}, 48, None, "no known observation is 'hight_scan'. Did you mean"),
         (LAB | {"joint_ids_map": [99] * 12}, 48, None, "joint_ids_map has the index 99, and there are 12 values"),
         (describe_walk(), 45, {"observations": 5}, "observations"),
         ({"a": 1}, 45, None, "in none of the known forms"),
