@@ -18,6 +18,7 @@ from rlctl.task.mujoco.robot import Robot
 _OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature", "target_speed")
 _REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")
 _USUAL_COMMANDS = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.5, 0.5]}
+_OF_GOALS = ("pose_command", "position_command", "pos_command", "goal", "target_pos", "target_heading", "waypoint")
 _USUAL_SCAN = {
     "x": [round(0.1 * number, 1) for number in range(-8, 9)],
     "y": [round(0.1 * number, 1) for number in range(-5, 6)],
@@ -184,9 +185,14 @@ def pick(values: Sequence[Any], order: Sequence[int], source: str, name: str) ->
 
 
 def refuse_motion(name: str, source: str) -> None:
-    """Raise `UsageError` for what rlctl does not observe of a motion: where the robot is on it, or its phase alone."""
+    """Raise `UsageError` for what rlctl does not observe of a motion, or of a goal: where it is."""
     if "motion" in name or "anchor" in name or name.endswith("/phase"):
         raise UsageError(
             f"{source}: observes {name}, which is not imported; of a motion, policies may observe motion_command and "
             "motion_anchor_ori_b"
+        )
+    if any(word in name for word in _OF_GOALS):
+        raise UsageError(
+            f"{source}: observes {name}: policies that reach a goal are not imported; those that follow velocity "
+            "commands or a clip are"
         )

@@ -14,8 +14,8 @@ import numpy as np
 from rlctl import output
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, RecipeError, UsageError
-from rlctl.importing.foreign import metadata, own, rl_sar, unitree_gym, unitree_lab
+from rlctl.errors import ArtifactError, RecipeError, TaskError, UsageError
+from rlctl.importing.foreign import isaac_lab, metadata, own, rl_sar, unitree_gym, unitree_lab
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.importing.foreign.onnx_network import read_onnx, read_tables
@@ -47,7 +47,7 @@ class DeploymentReader(Protocol):
         """Return what the file says."""
 
 
-READERS: Sequence[DeploymentReader] = (unitree_lab, unitree_gym, rl_sar, own)
+READERS: Sequence[DeploymentReader] = (unitree_lab, isaac_lab, unitree_gym, rl_sar, own)
 """Modules that read files; each has `TITLE`, `matches` and `read`."""
 
 
@@ -120,7 +120,7 @@ def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: 
     if files.model is None:
         raise UsageError("--deploy needs the robot: --model ROBOT.urdf or ROBOT.xml")
     network, own_metadata = read_network(file)
-    robot = read_robot(find_model_file(files.model))
+    robot = read_robot(_find_model(files.model, "--model"))
     draft, form = read_draft(file, files.deploy, own_metadata, robot, network)
     chosen = files.motion or draft.motion
     if chosen is None:
@@ -130,7 +130,7 @@ def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: 
     deployment = draft.complete(settings, robot, network, clip)
     ground = motion = ""
     if files.terrain:
-        ground = str(find_model_file(files.terrain).resolve())
+        ground = str(_find_model(files.terrain, "--terrain").resolve())
     if clip is not None:
         motion = str(_write_clip(clip, target.absolute().parent))
     parameters: dict[str, Any] = {"robot_file": str(robot.path), "terrain": ground, "motion_file": motion}
@@ -141,6 +141,13 @@ def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: 
         notes.append(f"task.tolerance: {slow:.3g} m/s, half of the fastest command, for success of a slow robot")
     policy = make_policy(network, deployment, parameters, target)
     return ImportedPolicy(policy, deployment, form, tuple(notes))
+
+
+def _find_model(name: str, option: str) -> Path:
+    try:
+        return find_model_file(name)
+    except TaskError as error:
+        raise ArtifactError(f"{option}: {error}") from None
 
 
 def _read_clip(file: Path, rate: float | None, robot: Robot) -> tuple[MotionClip, list[str]]:
@@ -192,6 +199,7 @@ def read_draft(
     content = yaml_text.load(yaml_text.read_text(deploy), str(deploy), foreign=True)
     if not isinstance(content, dict):
         raise RecipeError(f"{deploy}: expected a mapping of names to values")
+    isaac_lab.refuse_leapp(content, str(deploy))
     for reader in READERS:
         if reader.matches(content):
             try:

@@ -71,6 +71,8 @@ class MujocoScene:
         child = source.spec
         if not floor:
             _delete_floor(child)
+            if child.worldbody.first_body() is None:
+                raise TaskError(f"{source.path}: it has no body that moves")
         for key in list(child.keys):  # poses of this file alone, which nobody uses here
             child.delete(key)
         for joint in child.joints:

@@ -109,6 +109,69 @@ def test_deploy_yaml_of_unitree_rl_lab_has_two_orders(run_import):
     assert "joint_ids_map: guessed the order FR, FL, RR, RL of Unitree's quadrupeds" in imported.notes
 
 
+DESCRIPTORS = {  # as Isaac Lab writes them
+    "actions": [
+        {
+            "name": "joint_position_action",
+            "clip": None,
+            "joint_names": JOINTS,
+            "offset": STANCE,
+            "scale": 0.5,
+        }
+    ],
+    "articulations": {
+        "robot": {
+            "joint_names": JOINTS[::-1],
+            "default_joint_stiffness": [float(number) for number in range(1, 13)],
+            "default_joint_damping": [1.0] * 12,
+            "default_joint_armature": [0.0] * 12,
+        }
+    },
+    "observations": {
+        "policy": [
+            {"name": "base_lin_vel", "overloads": {"clip": None, "history_length": 0, "scale": None}},
+            {"name": "generated_commands", "overloads": {"scale": [2.0, 2.0, 0.25]}},
+            {"name": "joint_pos_rel", "joint_names": JOINTS, "joint_pos_offsets": STANCE},
+            {"name": "last_action", "overloads": {"clip": None, "history_length": 3}},
+        ]
+    },
+    "scene": {"decimation": 4, "dt": 0.02, "physics_dt": 0.005},
+}
+
+
+def test_io_descriptors_of_isaac_lab(run_import):
+    imported = run_import(DESCRIPTORS, 3 + 3 + 12 + 36)
+    deployment = imported.deployment
+    assert imported.form == "IO descriptors of Isaac Lab"
+    assert deployment.stiffness == tuple(float(number) for number in range(12, 0, -1))
+    assert (deployment.control_dt, deployment.physics_dt) == (0.02, 0.005)
+    assert deployment.observations[1].scale == (2.0, 2.0, 0.25)
+    assert deployment.history == {"last_action": 3}
+    assert deployment.action_scale == (0.5,) * 12
+
+
+def test_gains_of_explicit_actuators_are_asked_for(run_import):
+    robot = {**DESCRIPTORS["articulations"]["robot"], "default_joint_stiffness": [0.0] * 12}
+    content = {**DESCRIPTORS, "articulations": {"robot": robot}}
+    with pytest.raises(UsageError, match=r"does not say: stiffness\. Give --set stiffness=40"):
+        run_import(content, 54)
+    assert run_import(content, 54, {"stiffness": 30}).deployment.stiffness == (30.0,) * 12
+
+
+def test_a_command_that_is_no_velocity(run_import):
+    goal = {"policy": [{"name": "generated_commands", "shape": [4]}]}
+    with pytest.raises(
+        UsageError, match="generated_commands has 4 numbers.* policies that reach a goal are not imported"
+    ):
+        run_import({**DESCRIPTORS, "observations": goal}, 4)
+
+
+def test_leapp_is_refused_with_what_to_do(run_import):
+    content = {"models": {}, "pipeline": {}, "system information": {}}
+    with pytest.raises(UsageError, match=r"LEAPP, .* is not imported\ngive the policy\.onnx that Isaac Lab's"):
+        run_import(content, 45)
+
+
 def test_height_scan_of_isaac_lab(run_import):
     observations = {**LAB["observations"], "height_scan": {"scale": [5.0] * 187, "clip": [-1.0, 1.0]}}
     imported = run_import({**LAB, "observations": observations}, 48 + 187)
@@ -214,6 +277,7 @@ def test_columns_of_histories():
         (GYM, 47, {"stifness": 1}, "a deployment has no 'stifness'. Did you mean 'stiffness'"),
         (LAB | {"observations": {"motion_command": {}}}, 24, None, "give the one it was trained with: --motion FILE"),
         (LAB | {"observations": {"motion_anchor_pos_b": {}}}, 48, None, "observes motion_anchor_pos_b, which is not"),
+        (LAB | {"observations": {"pose_command": {}}}, 48, None, "policies that reach a goal are not imported"),
         (LAB | {"observations": {"hight_scan": {}}}, 48, None, "no known observation is 'hight_scan'. Did you mean"),
         (LAB | {"joint_ids_map": [99] * 12}, 48, None, "joint_ids_map has the index 99, and there are 12 values"),
         (describe_walk(), 45, {"observations": 5}, "observations"),
@@ -448,6 +512,17 @@ def test_anchors_and_large_files_are_refused(tmp_path):
         file.truncate(10**9)
     with pytest.raises(ArtifactError, match="too large"):
         import_policy(tmp_path / "policy.pt", ForeignFiles(tmp_path / "large.yaml", A1))
+
+
+def test_models_that_are_no_robot(tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    deploy = write_yaml(tmp_path / "deploy.yaml", describe_walk())
+    with pytest.raises(ArtifactError, match=r"--model: model file 'no\.xml' not found"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, "no.xml"))
+    floor = tmp_path / "floor.xml"
+    floor.write_text('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
+    with pytest.raises(UsageError, match=r"--model: .*floor\.xml: it has no body that moves"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, str(floor)))
 
 
 def test_other_files_are_refused(tmp_path):
