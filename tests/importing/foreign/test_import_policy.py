@@ -161,7 +161,7 @@ def test_gains_of_explicit_actuators_are_asked_for(run_import):
 def test_a_command_that_is_no_velocity(run_import):
     goal = {"policy": [{"name": "generated_commands", "shape": [4]}]}
     with pytest.raises(
-        UsageError, match="generated_commands has 4 numbers.* policies that reach a goal are not imported"
+        UsageError, match=r"generated_commands has 4 numbers.* policies that reach a goal are not imported"
     ):
         run_import({**DESCRIPTORS, "observations": goal}, 4)
 
