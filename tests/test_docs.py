@@ -161,13 +161,18 @@ def test_mappings_have_known_keys():
     MappingFile.model_validate(yaml_text.load(block.text, str(block)))
 
 
-def test_deployments_are_complete_but_for_what_the_model_has():
+@pytest.mark.parametrize("block", [each for each in find_blocks("yaml") if is_deployment(each)], ids=str)
+def test_deployments_are_complete_but_for_what_the_model_has(block):
     from rlctl.task.deployment import Deployment
 
-    (block,) = [each for each in find_blocks("yaml") if is_deployment(each)]
     content = yaml_text.load(block.text, str(block))
-    of_model = {"joints": list("abcdefghijkl"), "stiffness": [35.0] * 12, "damping": [0.5] * 12, "start_height": 0.3}
-    Deployment(**{**content, "action_scale": [content["action_scale"]] * 12, **of_model})
+    joints = list("abcdefghijkl")
+    of_model = {"joints": joints, "stiffness": 35.0, "damping": 0.5, "default_positions": 0.0}
+    values = {**of_model, **content, "start_height": 0.3}
+    for name in ("stiffness", "damping", "default_positions", "action_scale", "target_speed"):
+        if isinstance(values.get(name), float):
+            values[name] = [values[name]] * len(joints)
+    Deployment(**values)
 
 
 def test_limits_are_limits_of_reach():

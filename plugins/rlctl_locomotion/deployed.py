@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.task import Body, Box, Event, Joints, Sim, TaskError
-from rlctl.task.deployment import COMMANDS, NOT_TRAINED, ORIENTATION, Deployment, ObservedPart
-from rlctl.task.rotations import rotate_inverse
+from rlctl.task import Body, Box, Event, Joints, Sim, TaskError, WorldRngs
+from rlctl.task.deployment import COMMANDS, NOT_TRAINED, ORIENTATION, USUAL_TOLERANCE, Deployment, ObservedPart
+from rlctl.task.reference import find_heading
+from rlctl.task.rotations import rotate, rotate_inverse
 from rlctl_locomotion.walk import Walk
 
 NOISE = {  # events of observations
@@ -16,7 +17,18 @@ NOISE = {  # events of observations
     "position_noise": "joint_positions",
     "velocity_noise": "joint_velocities",
 }
-UNITS = {**Walk.observation_units, "velocity": "m/s", "euler": "rad"}
+UNITS = {
+    **Walk.observation_units,
+    "velocity": "m/s",
+    "euler": "rad",
+    "accelerometer": "m/s^2",
+    "contacts": "1: touches something, 0: does not",
+    "targets": "rad",
+    "heights": "m",
+}
+AROUND = np.stack(np.meshgrid(np.linspace(-1.3, 1.3, 9), np.linspace(-1.3, 1.3, 9)), -1).reshape(-1, 2)
+"""Where the ground is looked at before a start, from the trunk, in units of its height."""
+AT_REST = np.array([0.0, 0.0, 9.81])  # [m/s^2], what an accelerometer measures
 OTHER_STIFFNESS, OTHER_DAMPING, OTHER_ARMATURE = 100.0, 2.0, 0.01  # of joints that the policy does not move
 ENDLESS = 1e6  # [N m], of joints without a limit
 
@@ -28,10 +40,11 @@ class Deployed(Walk):
     robot_file: str = ""  # URDF or MJCF
     deployment: Deployment | None = None
     terrain: str = ""  # model file of the ground; empty: flat
-    tolerance: float = 0.25  # [m/s], largest mean error of the velocity in an episode that succeeds
+    tolerance: float = USUAL_TOLERANCE  # [m/s], largest mean error of the velocity in an episode that succeeds
     start_noise: float = 0.02  # [rad], of every joint, to each side of the default pose
 
     described: Deployment = field(init=False, repr=False)
+    commanded: np.ndarray = field(init=False, repr=False)  # [rad], targets from the default positions
     robot = ""
     action_meaning = "joint angles from the default pose, times the action's scale"
     mirror = {}
@@ -46,7 +59,7 @@ class Deployed(Walk):
             )
         described = self.described = self.deployment
         count = len(described.joints)
-        shapes = dict.fromkeys(("last_action", "action_change"), (count,))
+        shapes = dict.fromkeys(("last_action", "action_change", "commanded"), (count,))
         low, high = (np.array([described.commands.get(name, (0.0, 0.0))[end] for name in COMMANDS]) for end in (0, 1))
         self._define(
             model=Path(self.robot_file),
@@ -73,13 +86,13 @@ class Deployed(Walk):
         vars(self).update(values)
 
     def _list_units(self) -> dict[str, str]:
-        observed: set[str] = {part.kind for part in self.described.observations}
+        observed: set[str] = {part.kind for part in self.described.measured_parts}
         if observed & {"gravity", "euler"}:  # computed from it
             observed.add(ORIENTATION)
         return {name: unit for name, unit in UNITS.items() if name in observed}
 
     def _choose_events(self) -> dict[str, Event]:
-        observed = {part.kind for part in self.described.observations}
+        observed = {part.kind for part in self.described.measured_parts}
         events = dict(Walk.events)
         for name, kind in NOISE.items():
             if kind not in observed:
@@ -108,6 +121,19 @@ class Deployed(Walk):
             limits[self.joints] = described.max_torque
         self.max_force = limits.tolist()
         self.is_wheel = np.isin(self.joint_order, described.wheels)
+        self.farthest = np.full(len(self.joints), np.inf)  # [rad], that a target moves in a step
+        if described.target_speed:
+            self.farthest = np.array(described.target_speed) * described.control_dt
+        self.prepare_sensors()
+
+    def prepare_sensors(self) -> None:
+        """Prepare what measures contacts; raises `TaskError` for a link or a sensor that the robot does not have."""
+        for part in self.described.observations:
+            if part.kind == "contacts":
+                for link in part.links:
+                    self.body.add_contact_sensor(link)
+            if part.kind == "accelerometer":
+                self.body.sensor(part.sensor)
 
     def _spread(self, values: tuple[float, ...], of_others: float, count: int) -> np.ndarray:
         """Return values of the policy's joints as an array of all joints of the model."""
@@ -121,7 +147,9 @@ class Deployed(Walk):
 
     def act(self, action: np.ndarray) -> None:
         """Set the joints' target angles, and the speeds of wheels."""
-        commanded = self.reach * action
+        wanted = self.reach * action
+        low, high = self.commanded - self.farthest, self.commanded + self.farthest
+        self.commanded = commanded = np.clip(wanted, low, high)
         targets = np.tile(self.stance, (self.worlds, 1))
         speeds = np.zeros_like(targets)
         speeds[:, self.joints] = np.where(self.is_wheel, commanded, 0.0)
@@ -134,7 +162,7 @@ class Deployed(Walk):
     def observe(self) -> dict[str, np.ndarray]:
         """Return what the policy's observations are computed from, in its order."""
         self.orientation = self.body.base_orientation
-        return {part.kind: self._measure(part) for part in self.described.observations}
+        return {part.kind: self._measure(part) for part in self.described.measured_parts}
 
     def _measure(self, part: ObservedPart) -> np.ndarray:
         if part.kind == "gyroscope":
@@ -151,7 +179,38 @@ class Deployed(Walk):
             return self.body.joint_velocities[:, self.joints]
         if part.kind == "last_action":
             return self.last_action
+        if part.kind == "targets":
+            return self.stance[self.joints] + self.commanded
+        if part.kind == "heights":
+            return self._scan_heights()
+        if part.kind == "contacts":
+            return np.stack([self.body.touches(link) for link in part.links], axis=-1).astype(float)
+        if part.kind == "accelerometer":
+            at_rest = rotate_inverse(self.orientation, AT_REST)
+            return np.where(self.steps[:, None] == 0, at_rest, self.body.sensor(part.sensor))
         return (self.steps * self.control_dt)[:, None]  # of the clock
+
+    def _scan_heights(self) -> np.ndarray:
+        """Return how far the ground is below the trunk's frame [m], at the points of the scan."""
+        scan = self.described.scan
+        assert scan is not None
+        place = self.body.link_position(self.body.base_name)[:, None]
+        around = rotate(find_heading(self.orientation)[:, None], np.pad(scan.points, ((0, 0), (0, 1))))
+        return place[..., 2] - self.ground.surface_heights((place + around)[..., :2])
+
+    def draw_place(self, rng: WorldRngs, worlds: np.ndarray) -> np.ndarray:
+        """Return where the trunk starts [m], shape (k, 3): above the highest ground near it."""
+        place = super().draw_place(rng, worlds)
+        if self.terrain:
+            place[:, 2] += self.ground.surface_heights(place[:, None, :2] + self.start_height * AROUND).max(axis=1)
+        return place
+
+    def measure_height(self) -> np.ndarray:
+        """Return the height of the trunk above the ground [m]."""
+        position = self.body.base_position
+        if not self.terrain:
+            return position[:, 2]
+        return position[:, 2] - self.ground.surface_heights(position[:, :2])
 
     def _turn(self, vector: np.ndarray, part: ObservedPart) -> np.ndarray:
         return vector if part.frame == "world" else rotate_inverse(self.orientation, vector)

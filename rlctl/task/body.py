@@ -132,6 +132,17 @@ class Body:
         """
         self._refuse("joint_reaction")
 
+    def add_contact_sensor(self, link: str) -> None:
+        """Measure whether a link touches anything; `touches` reads it. Call it in `build`."""
+        self._refuse("add_contact_sensor")
+
+    def touches(self, link: str) -> NDArray[np.bool_]:
+        """Return whether a link touches another body, or another link of its own, shape ().
+
+        It needs `add_contact_sensor`. PyBullet tells it of the last physics step.
+        """
+        self._refuse("touches")
+
     def solve_inverse_kinematics(
         self, link: str, position: Sequence[float] | Array, orientation: Sequence[float] | Array | None = None
     ) -> Array:
@@ -169,6 +180,13 @@ class Body:
     def contacts_with(self, other: Any) -> Contacts:
         """Return the points where this body touches `other`, at the last physics step."""
         self._refuse("contacts_with")
+
+    def surface_heights(self, places: Array) -> Array:
+        """Return the heights of this body's top [m] at `places` [m], world frame, shape (..., 2) to (...).
+
+        For ground: the body stands where it was built. Where it has no surface the height is 0.
+        """
+        self._refuse("surface_heights")
 
     def distance_to(self, other: Any, link: str | None = None) -> float:
         """Return the shortest distance [m] between the collision shapes of two bodies, negative where they overlap.

@@ -18,7 +18,15 @@ from rlctl.task.motion import MotionClip, write_motion
 from rlctl.task.mujoco.robot import read_robot
 from rlctl_robot.diagnose.deployed import diagnose_deployment
 from rlctl_robot.diagnose.mapped_actor import map_action, map_observation
-from tests.importing.foreign.policies import A1, describe_walk, expect_as, read_walk, write_onnx, write_yaml
+from tests.importing.foreign.policies import (
+    A1,
+    describe_walk,
+    expect_as,
+    read_walk,
+    write_onnx,
+    write_scene,
+    write_yaml,
+)
 
 FOREIGN = {
     "observations": [
@@ -88,6 +96,92 @@ def test_wheels_follow_speeds():
     # The damper of 1 N m s/rad pushes towards 0.25 * 4 = 1 rad/s.
     assert 0.2 < observation[0, 2] < 1.5
     worlds.close()
+
+
+def test_what_a_robot_with_sensors_observes(tmp_path):
+    observations = [
+        {"kind": "accelerometer", "shift": [1.3, 0.0, 0.0]},
+        {"kind": "constant", "values": [0.0, 0.0]},  # part of the network's input only
+        {"kind": "last_action", "history": 2},
+        {"kind": "targets", "relative": False},
+        {"kind": "contacts", "links": ["left", "right"]},
+    ]
+    deployment = {
+        "joints": ["right_hip", "left_hip"],
+        "default_positions": [0.1, -0.1],
+        "action_scale": [0.25] * 2,
+        "stiffness": [20.0] * 2,
+        "damping": [1.0] * 2,
+        "target_speed": [5.0, 1e3],
+        "control_dt": 0.02,
+        "observations": observations,
+        "start_height": 0.16,
+    }
+    spec = EnvSpec(TASK, {"deployment": deployment, "robot_file": write_scene(tmp_path)})
+    with contextlib.closing(spec.make_worlds(2)) as worlds:
+        first = worlds.reset(np.arange(2), [0, 1])
+        assert first.shape == (2, 3 + 2 * 2 + 2 + 2)
+        assert first[0] == pytest.approx([1.3, 0.0, 9.81, 0.0, 0.0, 0.0, 0.0, 0.1, -0.1, 0.0, 0.0])
+        # 0.25 * 2 rad are wanted; the target of the right hip moves by 5 rad/s * 0.02 s.
+        second = worlds.step(np.full((2, 2), 2.0, np.float32)).observation
+        assert second[0, 3:9] == pytest.approx([0.0, 0.0, 2.0, 2.0, 0.1 + 0.1, -0.1 + 0.5])
+        for _ in range(100):
+            last = worlds.step(np.array([[0.0, 0.0], [-0.4, 0.4]], np.float32)).observation
+    assert last[0, :3] == pytest.approx([1.3, 0.0, 9.81], abs=0.3)
+    assert last[:, 9:].tolist() == [[1.0, 1.0], [1.0, 1.0]]
+
+
+TERRAIN = """
+<mujoco><worldbody>
+  <geom type="plane" size="20 20 1"/>
+  <geom type="box" pos="1.35 0 0.05" size="1 5 0.05"/>
+</worldbody></mujoco>
+"""
+
+
+@pytest.fixture
+def scanning(tmp_path):
+    """Return a robot that observes heights before a step of 0.1 m at x = 0.35 m, as a specification."""
+    terrain = tmp_path / "step.xml"
+    terrain.write_text(TERRAIN)
+    scan = {"x": [-0.3, 0.0, 0.45], "y": [-0.1, 0.1]}
+    parts = [{"kind": "heights", "shift": -0.5, "clip": [-1.0, 1.0], "scale": 5.0}]
+    deployment = describe_walk(observations=parts, scan=scan, start_height=0.3)
+    return EnvSpec(TASK, {"deployment": deployment, "robot_file": A1, "start_noise": 0.0}), str(terrain)
+
+
+def test_heights_of_flat_ground(scanning):
+    flat, _ = scanning
+    with contextlib.closing(flat.make_worlds(2)) as worlds:
+        first = worlds.reset(np.arange(2), [0, 1])
+        height = worlds.task.body.link_position(worlds.task.body.base_name)[0, 2]
+    # The scale of 5 is in the network.
+    assert first == pytest.approx(np.full((2, 6), height - 0.5), abs=1e-5)
+
+
+def test_heights_of_a_terrain_turn_with_the_robot(scanning):
+    spec, terrain = scanning
+    with contextlib.closing(EnvSpec(TASK, {**spec.parameters, "terrain": terrain}).make_worlds(2)) as worlds:
+        first = worlds.reset(np.arange(2), [0, 1])
+        task = worlds.task
+        # It stands 0.3 m above the highest ground near it.
+        assert task.body.base_position[0, 2] == pytest.approx(0.4)
+        assert task.measure_height()[0] == pytest.approx(0.4)
+        assert first[0] - first[0, 0] == pytest.approx([0.0, 0.0, -0.1] * 2, abs=1e-5)
+        half_turn = (0.0, 0.0, 1.0, 0.0)
+        task.body.set_base((0.1, 0.0, 0.4), half_turn, worlds=np.array([1]))
+        turned = task.observe()["heights"][1]
+        # Behind it, 0.3 m, is now x = 0.4 m.
+        assert turned - turned[1] == pytest.approx([-0.1, 0.0, 0.0] * 2, abs=1e-5)
+
+
+def test_points_of_a_scan_in_both_orders():
+    described = describe_walk(observations=[{"kind": "heights"}])
+    scan = {"x": [0.0, 1.0], "y": [2.0, 3.0]}
+    first = Deployment(**described, scan=scan).scan.points.tolist()
+    other = Deployment(**described, scan={**scan, "x_first": False}).scan.points.tolist()
+    assert first == [[0.0, 2.0], [1.0, 2.0], [0.0, 3.0], [1.0, 3.0]]
+    assert other == [[0.0, 2.0], [0.0, 3.0], [1.0, 2.0], [1.0, 3.0]]
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from rlctl.task.mujoco.opengl import draw_without_display
 from rlctl.task.mujoco.sim import MujocoSim
 from rlctl.task.pybullet.sim import PybulletSim
 from rlctl_manipulation.peg_insert import SCARA
+from tests.importing.foreign.policies import write_scene
 from tests.task import models
 from tests.task.tasks import Cart, Slider
 
@@ -150,6 +151,34 @@ def test_a_force_sensor_measures_what_hangs_from_it(world):
         force = arm.joint_reaction("sensor")[:3]
     # Peg and tip, below the sensor, weigh 51 g.
     assert force == pytest.approx([0.0, 0.0, 9.81 * 0.051], abs=0.01)
+
+
+@pytest.mark.pybullet
+@pytest.mark.parametrize("world", [PybulletSim, MujocoSim])
+def test_a_contact_sensor_tells_which_link_touches(world):
+    options = {"solref": 0.02} if world is MujocoSim else {}
+    with closing(world(control_dt=0.02, substeps=4, **options)) as sim:
+        sim.load("ground", "plane.urdf", fixed=True)
+        cube = sim.load("cube", "cube_small.urdf", position=(0.0, 0.0, 0.1))
+        cube.add_contact_sensor(cube.base_name)
+        sim.save()
+        sim.step()
+        assert not cube.touches(cube.base_name)
+        for _ in range(20):
+            sim.step()
+        assert cube.touches(cube.base_name)
+        with pytest.raises(TaskError, match=r"link 'top' has no contact sensor: call add_contact_sensor\('top'\)"):
+            cube.touches("top")
+
+
+def test_a_base_without_mass_and_a_floor_that_is_a_body(tmp_path):
+    with closing(MujocoSim(control_dt=0.02, substeps=4)) as sim:
+        robot = sim.load("robot", write_scene(tmp_path), floor=False)
+        sim.save()
+        assert robot.link_names == ["trunk", "left", "right"]
+        robot.set_base((0.0, 0.0, 2.0))
+        assert robot.base_position == pytest.approx([0.0, 0.0, 2.0])
+        assert robot.link_position("left") == pytest.approx([0.0, 0.1, 1.9])
 
 
 def test_gears_and_a_linkage_hold():

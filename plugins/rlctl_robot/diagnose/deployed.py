@@ -19,7 +19,7 @@ from rlctl.play.playing import Playing
 from rlctl.policy.actor import Actor, Rows
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
-from rlctl.task.deployment import TASKS, Deployment
+from rlctl.task.deployment import TASKS, USUAL_TOLERANCE, Deployment
 from rlctl.task.mujoco.robot import Robot, read_robot
 from rlctl_robot.diagnose.mapped_actor import MappedActor
 from rlctl_robot.diagnose.variants import Variant, list_variants
@@ -47,16 +47,22 @@ class Score:
     time_up: float  # mean part of the time
     error: float  # mean velocity error [m/s], or of a policy that follows a clip mean error of the joints [rad]
     follows_motion: bool = False
+    scale: float = 1.0  # of the errors that are allowed: less than 1 for robots whose commands are slow
 
     @property
     def walks(self) -> bool:
         """Whether the robot stays up and follows its commands."""
-        return self.up >= _UP and self.error <= _FOLLOWS
+        return self.up >= _UP and self.error <= _FOLLOWS * self.scale
+
+    @property
+    def walks_well(self) -> bool:
+        """Whether it walks so well that nothing is searched."""
+        return self.walks and self.error <= _WELL * self.scale
 
     @property
     def rank(self) -> float:
         """Higher is better."""
-        return self.time_up + 0.5 * self.up - _ERROR_WEIGHT * self.error
+        return self.time_up + 0.5 * self.up - _ERROR_WEIGHT * self.error / self.scale
 
     def describe(self) -> str:
         """Return the score as text."""
@@ -108,7 +114,7 @@ def diagnose_deployment(
     player = _Player(policy, spec, own, seed)
     report("playing the policy as its file says")
     own_score = player.judge(own, _WORLDS, _SECONDS)
-    if own_score.walks and own_score.error <= _WELL:
+    if own_score.walks_well:
         return DeploymentDiagnosis(str(policy.path), own_score, 0, None, None, {}, (), time.monotonic() - began)
     robot = read_robot(Path(str(spec.parameters["robot_file"])))
     variants = list_variants(own, robot)
@@ -127,10 +133,10 @@ def diagnose_deployment(
 
 def _is_named(score: Score, own: Score) -> bool:
     """Return whether a variant walks, and much better than the file's mapping does."""
-    if score.up < _ALL_UP or score.error > _FOLLOWS:
+    if score.up < _ALL_UP or score.error > _FOLLOWS * score.scale:
         return False
     stays_up = score.up - own.up >= _BETTER
-    follows = score.error <= _SMALLER * own.error and own.error - score.error >= _WELL / 2
+    follows = score.error <= _SMALLER * own.error and own.error - score.error >= _WELL / 2 * own.scale
     return stays_up or follows
 
 
@@ -150,6 +156,9 @@ class _Player:
 
     def __init__(self, policy: PolicyFile, spec: EnvSpec, own: Deployment, seed: int) -> None:
         self._policy, self._spec, self._own, self._seed = policy, spec, own, seed
+        self._scale = 1.0
+        if 0 < own.fastest_command < 2 * USUAL_TOLERANCE:
+            self._scale = own.fastest_command / (2 * USUAL_TOLERANCE)
 
     def choose(self, variants: Sequence[Variant], robot: Robot) -> list[Variant]:
         """Return the variants that do best in a short look."""
@@ -168,7 +177,7 @@ class _Player:
         with contextlib.closing(self._make_worlds(deployment, count)) as worlds:
             actor = MappedActor(NumpyActor(self._policy, count), self._own, deployment, [deployment] * count)
             played = _play(worlds, actor, self._list_seeds(count), seconds)
-            return _summarize(played, deployment.follows_motion)
+            return self._summarize(played)
 
     def _rank_mapped(self, variants: Sequence[Variant]) -> list[float]:
         """Return ranks of variants that need no other robot, played together in the worlds of the file's."""
@@ -183,8 +192,12 @@ class _Player:
                 seeds = self._list_seeds(_SHORT_WORLDS) * in_turn
                 played = _play(worlds, actor, seeds, _SHORT_SECONDS)
                 parts = played.reshape(in_turn, _SHORT_WORLDS, -1)
-                ranks += [_summarize(part).rank for part in parts[: len(some)]]
+                ranks += [self._summarize(part).rank for part in parts[: len(some)]]
         return ranks
+
+    def _summarize(self, played: np.ndarray) -> Score:
+        up, time_up, error = played.mean(axis=0).tolist()
+        return Score(up, time_up, error, self._own.follows_motion, self._scale)
 
     def _list_seeds(self, count: int) -> list[int]:
         return [self._seed + number for number in range(count)]
@@ -214,11 +227,6 @@ def _play(worlds: Any, actor: Actor, seeds: Sequence[int], seconds: float) -> np
             playing.stop(over)
     time_up = np.where(fell, alive / steps, 1.0)  # also where a clip ended first
     return np.stack([1.0 - fell, time_up, errors / np.maximum(alive, 1)], axis=1)
-
-
-def _summarize(played: np.ndarray, follows_motion: bool = False) -> Score:
-    up, time_up, error = played.mean(axis=0).tolist()
-    return Score(up, time_up, error, follows_motion)
 
 
 def show(result: DeploymentDiagnosis, json: str | None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.policy.actor import Actor, Array, Rows
-from rlctl.task.deployment import Deployment
+from rlctl.task.deployment import RELATIVE, Deployment
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,13 +48,14 @@ def _measure(own: Deployment, variant: Deployment) -> tuple[NDArray[Any], NDArra
     own_default, default = np.array(own.default_positions)[joints], np.array(variant.default_positions)
     own_scale, scale = np.array(own.action_scale)[joints], np.array(variant.action_scale)
     is_wheel = np.isin(variant.joints, own.wheels)
+    relative = {part.kind for part in variant.measured_parts if part.kind in RELATIVE and part.relative}
     for part in layout.parts:
         elements, factors, offsets = np.arange(part.size), np.ones(part.size), np.zeros(part.size)
-        if part.name in ("joint_positions", "joint_velocities", "last_action"):
+        if part.name in (*RELATIVE, "joint_velocities", "last_action"):
             elements = joints
         elif part.name == "motion":
             elements = np.concatenate([joints, len(joints) + joints])
-        if part.name == "joint_positions":
+        if part.name in relative:
             offsets = own_default - default
         elif part.name == "last_action":
             factors = own_scale / scale

@@ -22,7 +22,8 @@ _RATES = (0.25, 0.5, 2.0, 4.0)
 _SLOWEST = 0.1  # [s], between two actions
 _LEG = re.compile(r"(?P<row>[FRHL])(?P<side>[LR])_|(?P<first>[LR])(?P<second>[FH])_")  # FL_hip, LF_HAA
 _SIDE = re.compile(r"left|right|(?<![a-z])[lr](?=_)", re.IGNORECASE)
-_SIGNED = ("gyroscope", "velocity", "gravity", "joint_positions", "joint_velocities")
+_SIGNED = ("gyroscope", "velocity", "gravity", "accelerometer", "joint_positions", "joint_velocities", "targets")
+_UNITLESS = ("phase", "gravity", "anchor_orientation", "contacts")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,8 +197,8 @@ def _list_scales(deployment: Deployment) -> Iterator[Variant]:
         degree: "is in degrees, the policy expects radians",
         1 / degree: "is in radians, the policy expects degrees",
     }
-    for part in deployment.observations:
-        if part.kind in ("phase", "gravity", "anchor_orientation"):
+    for part in deployment.measured_parts:
+        if part.kind in _UNITLESS:
             continue
         for factor in _FACTORS:
             text = f"{part.kind}: its scale is {1 / factor:g} times the policy's"
@@ -216,7 +217,7 @@ def _list_signs(deployment: Deployment) -> Iterator[Variant]:
         if part.kind in _SIGNED:
             text = f"{part.kind} has the wrong sign"
             yield Variant("sign", text, _replace_part(deployment, part.kind, scale=_multiply(part.scale, -1.0)))
-        if part.kind in ("gyroscope", "gravity", "velocity", "command"):
+        if part.kind in ("gyroscope", "gravity", "velocity", "accelerometer", "command"):
             for element in range(3):
                 signs = np.ones(3)
                 signs[element] = -1.0
@@ -238,7 +239,7 @@ def _reverse(deployment: Deployment, kinds: Mapping[str, Any], joints: Sequence[
     signs = np.ones(len(deployment.joints))
     signs[list(joints)] = -1.0
     changed = _reverse_actions(deployment, joints)
-    for kind in ("joint_positions", "joint_velocities"):
+    for kind in ("joint_positions", "joint_velocities", "targets"):
         if kind in kinds:
             changed = _replace_part(changed, kind, scale=_multiply(kinds[kind], signs))
     return changed
@@ -305,7 +306,7 @@ def _list_histories(deployment: Deployment) -> Iterator[Variant]:
     yield Variant(
         "history", f"the policy's histories begin with the {first} value", _change(deployment, newest_first=newest)
     )
-    lengths = {part.history for part in deployment.observations}
+    lengths = {part.history for part in deployment.measured_parts}
     if len(lengths) == 1:
         order = "frames" if deployment.history_order == "terms" else "terms"
         has = "all parts of a step together" if order == "frames" else "all values of a part together"
@@ -327,7 +328,8 @@ def _list_parts(deployment: Deployment) -> Iterator[Variant]:
     """Yield orders of the observations in which two of one size are exchanged."""
     parts = list(deployment.observations)
     for one, other in itertools.combinations(range(len(parts)), 2):
-        if deployment.find_size(parts[one]) == deployment.find_size(parts[other]):
+        are_measured = "constant" not in (parts[one].kind, parts[other].kind)
+        if are_measured and deployment.find_size(parts[one]) == deployment.find_size(parts[other]):
             swapped = list(parts)
             swapped[one], swapped[other] = parts[other], parts[one]
             text = f"the observations {parts[one].kind} and {parts[other].kind} are exchanged"

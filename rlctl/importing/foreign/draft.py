@@ -15,9 +15,14 @@ from rlctl.task.deployment import MOTION, Deployment
 from rlctl.task.motion import MotionClip
 from rlctl.task.mujoco.robot import Robot
 
-_OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature")
+_OF_JOINTS = ("default_positions", "action_scale", "stiffness", "damping", "max_torque", "armature", "target_speed")
 _REQUIRED = ("default_positions", "action_scale", "stiffness", "damping", "control_dt", "observations")
 _USUAL_COMMANDS = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.3], "ang_vel_z": [-0.5, 0.5]}
+_OF_GOALS = ("pose_command", "position_command", "pos_command", "goal", "target_pos", "target_heading", "waypoint")
+_USUAL_SCAN = {
+    "x": [round(0.1 * number, 1) for number in range(-8, 9)],
+    "y": [round(0.1 * number, 1) for number in range(-5, 6)],
+}
 _USUAL_ANCHOR = "torso_link"  # of Unitree's G1, with which whole_body_tracking and mjlab train
 _USUAL_ARMATURE = 0.01  # [kg m^2], of motors and gears of walking robots
 _FORMS = {
@@ -73,6 +78,7 @@ class Draft:
                 turn = clip.root_orientation[0].tolist()
             values["start_height"] = round(robot.measure_start(pose, turn), 4)
         deployment = validation.build(Deployment, values, UsageError, self.source)
+        self._check_parts(deployment, robot)
         self._check_sizes(deployment, network)
         self._check_motion(deployment, clip)
         return deployment
@@ -108,6 +114,9 @@ class Draft:
         kinds = [part.get("kind") for part in observed if isinstance(part, dict)]
         if "anchor_orientation" in kinds:
             self._guess_anchor(values, robot)
+        if "heights" in kinds and values.get("scan") is None:
+            values["scan"] = _USUAL_SCAN
+            self.notes.append("scan: guessed 17 x 11 points, 0.1 m apart, as in Isaac Lab's velocity tasks")
         if not values.get("commands") and not set(kinds) & set(MOTION):
             values["commands"] = _USUAL_COMMANDS
             ranges = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in _USUAL_COMMANDS.items())
@@ -138,6 +147,19 @@ class Draft:
         if clip is not None and not deployment.follows_motion:
             raise UsageError(f"{self.source}: the policy observes no clip; leave out --motion {clip.name}")
 
+    def _check_parts(self, deployment: Deployment, robot: Robot) -> None:
+        """Raise `UsageError` for links and sensors that are observed and that the robot does not have."""
+        for part in deployment.observations:
+            for link in part.links:
+                check_name(link, robot.links, f"{self.source}: {robot.path.name} has no link", UsageError)
+            if part.kind == "accelerometer" and not robot.sensors:
+                raise UsageError(
+                    f"{self.source}: observes an accelerometer, and {robot.path.name} has no sensors; give an MJCF "
+                    "file with <accelerometer>"
+                )
+            if part.kind == "accelerometer":
+                check_name(part.sensor, robot.sensors, f"{self.source}: {robot.path.name} has no sensor", UsageError)
+
     def _check_sizes(self, deployment: Deployment, network: ForeignNetwork) -> None:
         if len(deployment.joints) != network.action_size:
             raise UsageError(
@@ -163,9 +185,14 @@ def pick(values: Sequence[Any], order: Sequence[int], source: str, name: str) ->
 
 
 def refuse_motion(name: str, source: str) -> None:
-    """Raise `UsageError` for what rlctl does not observe of a motion: where the robot is on it, or its phase alone."""
+    """Raise `UsageError` for what rlctl does not observe of a motion, or of a goal: where it is."""
     if "motion" in name or "anchor" in name or name.endswith("/phase"):
         raise UsageError(
             f"{source}: observes {name}, which is not imported; of a motion, policies may observe motion_command and "
             "motion_anchor_ori_b"
+        )
+    if any(word in name for word in _OF_GOALS):
+        raise UsageError(
+            f"{source}: observes {name}: policies that reach a goal are not imported; those that follow velocity "
+            "commands or a clip are"
         )

@@ -14,8 +14,8 @@ import numpy as np
 from rlctl import output
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import ArtifactError, RecipeError, UsageError
-from rlctl.importing.foreign import metadata, own, rl_sar, unitree_gym, unitree_lab
+from rlctl.errors import ArtifactError, RecipeError, TaskError, UsageError
+from rlctl.importing.foreign import isaac_lab, metadata, own, rl_sar, unitree_gym, unitree_lab
 from rlctl.importing.foreign.draft import Draft
 from rlctl.importing.foreign.network import ForeignNetwork
 from rlctl.importing.foreign.onnx_network import read_onnx, read_tables
@@ -27,7 +27,7 @@ from rlctl.recipe.sources import OF_THE_ENVIRONMENT, parse_settings
 from rlctl.storage import yaml_text
 from rlctl.storage.files import write_bytes
 from rlctl.task.clip_options import ClipOptions
-from rlctl.task.deployment import MOTION_TASK, TASK, Deployment
+from rlctl.task.deployment import MOTION_TASK, TASK, USUAL_TOLERANCE, Deployment
 from rlctl.task.model_files import find_model_file
 from rlctl.task.motion import MotionClip, write_motion
 from rlctl.task.motion_files import RobotJoints, read_clip
@@ -47,7 +47,7 @@ class DeploymentReader(Protocol):
         """Return what the file says."""
 
 
-READERS: Sequence[DeploymentReader] = (unitree_lab, unitree_gym, rl_sar, own)
+READERS: Sequence[DeploymentReader] = (unitree_lab, isaac_lab, unitree_gym, rl_sar, own)
 """Modules that read files; each has `TITLE`, `matches` and `read`."""
 
 
@@ -120,7 +120,7 @@ def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: 
     if files.model is None:
         raise UsageError("--deploy needs the robot: --model ROBOT.urdf or ROBOT.xml")
     network, own_metadata = read_network(file)
-    robot = read_robot(find_model_file(files.model))
+    robot = read_robot(_find_model(files.model, "--model"))
     draft, form = read_draft(file, files.deploy, own_metadata, robot, network)
     chosen = files.motion or draft.motion
     if chosen is None:
@@ -130,12 +130,24 @@ def _read(file: Path, files: ForeignFiles, settings: Mapping[str, Any], target: 
     deployment = draft.complete(settings, robot, network, clip)
     ground = motion = ""
     if files.terrain:
-        ground = str(find_model_file(files.terrain).resolve())
+        ground = str(_find_model(files.terrain, "--terrain").resolve())
     if clip is not None:
         motion = str(_write_clip(clip, target.absolute().parent))
-    places = {"robot_file": str(robot.path), "terrain": ground, "motion_file": motion}
-    policy = make_policy(network, deployment, places, target)
-    return ImportedPolicy(policy, deployment, form, (*draft.notes, *found))
+    parameters: dict[str, Any] = {"robot_file": str(robot.path), "terrain": ground, "motion_file": motion}
+    notes = [*draft.notes, *found]
+    slow = deployment.fastest_command / 2
+    if clip is None and 0 < slow < USUAL_TOLERANCE:
+        parameters["tolerance"] = round(slow, 3)
+        notes.append(f"task.tolerance: {slow:.3g} m/s, half of the fastest command, for success of a slow robot")
+    policy = make_policy(network, deployment, parameters, target)
+    return ImportedPolicy(policy, deployment, form, tuple(notes))
+
+
+def _find_model(name: str, option: str) -> Path:
+    try:
+        return find_model_file(name)
+    except TaskError as error:
+        raise ArtifactError(f"{option}: {error}") from None
 
 
 def _read_clip(file: Path, rate: float | None, robot: Robot) -> tuple[MotionClip, list[str]]:
@@ -187,6 +199,7 @@ def read_draft(
     content = yaml_text.load(yaml_text.read_text(deploy), str(deploy), foreign=True)
     if not isinstance(content, dict):
         raise RecipeError(f"{deploy}: expected a mapping of names to values")
+    isaac_lab.refuse_leapp(content, str(deploy))
     for reader in READERS:
         if reader.matches(content):
             try:
@@ -197,15 +210,17 @@ def read_draft(
     raise UsageError(f"{deploy}: in none of the known forms: {known}. Describe it as docs/foreign-policies.md says")
 
 
-def make_policy(network: ForeignNetwork, deployment: Deployment, places: Mapping[str, str], path: Path) -> PolicyFile:
-    """Return the policy of a network for the task that its deployment and `places`, the model files, describe."""
+def make_policy(
+    network: ForeignNetwork, deployment: Deployment, parameters: Mapping[str, Any], path: Path
+) -> PolicyFile:
+    """Return the policy of a network for the task that its deployment and `parameters`, such as files, describe."""
     from rlctl.policy.torch_policy import build_network, describe_network, policy_name
 
-    parameters = {"deployment": deployment.dump(), **{name: value for name, value in places.items() if value}}
+    given = {name: value for name, value in parameters.items() if value}
     task = TASK
     if deployment.follows_motion:
         task = MOTION_TASK
-    spec = EnvSpec(task, parameters).resolve()
+    spec = EnvSpec(task, {"deployment": deployment.dump(), **given}).resolve()
     with contextlib.closing(spec.make_worlds(1)) as worlds:
         env = describe_worlds(worlds)
     info = PolicyInfo(

@@ -30,6 +30,10 @@ class ForeignLinear:
         weight[:, columns] = self.weight * factors
         return ForeignLinear(weight, self.bias)
 
+    def fix_inputs(self, is_fixed: NDArray[np.bool_], values: Array) -> ForeignLinear:
+        """Return the layer without those of its inputs that always have these values."""
+        return ForeignLinear(self.weight[:, ~is_fixed], self.bias + self.weight[:, is_fixed] @ values)
+
     def standardize(self, mean: Array, scale: Array) -> ForeignLinear:
         """Return the layer for inputs from which `mean` is not yet subtracted, and which are not yet times `scale`."""
         weight = self.weight * scale
@@ -87,8 +91,9 @@ class ForeignNetwork:
 
     def observe_as(self, deployment: Deployment) -> ForeignNetwork:
         """Return the network for observations as rlctl's task has them: in its order, in SI units."""
+        first = self.first.fix_inputs(*deployment.find_constants())
         columns, factors = deployment.find_columns()
-        return self.with_first(self.first.take_columns(columns, factors, deployment.layout.size))
+        return self.with_first(first.take_columns(columns, factors, deployment.layout.size))
 
     @property
     def algo(self) -> str:

@@ -28,10 +28,13 @@ TERMS = {
     "last_action": "last_action",
     "actions": "last_action",
     "gait_phase": "phase",
+    "height_scan": "heights",
+    "height_scanner": "heights",
     "motion_command": "motion",
     "motion_anchor_ori_b": "anchor_orientation",
 }
 """Names of Isaac Lab's observations."""
+_SCAN_OFFSET = 0.5  # [m], that Isaac Lab's height_scan subtracts
 _ABSOLUTE = "joint_pos"
 _POSITION = "JointPositionAction"
 _LEGS = ("FR", "FL", "RR", "RL")  # the order of the motors of Unitree's quadrupeds
@@ -101,8 +104,12 @@ def read_term(name: str, term: Mapping[str, Any], source: str) -> dict[str, Any]
         "velocity",
         "joint_positions",
         "joint_velocities",
+        "heights",
     ):
         part["clip"] = term["clip"]
+    if part["kind"] == "heights":
+        offset = dict(term.get("params") or {}).get("offset", _SCAN_OFFSET)
+        part["shift"] = -offset
     if name == _ABSOLUTE:
         part["relative"] = False
     if part["kind"] == "phase":

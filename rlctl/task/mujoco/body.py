@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ _FAR = 100.0  # [m]
 _SLIPPERY = 0.3
 """Friction below which contacts need more iterations of the solver than a task for batches takes (3, say)."""
 _SLIPPERY_ITERATIONS = 50  # as PyBullet and MuJoCo take for any task by default
+_SURFACE_GROUPS = np.array([1, 0, 0, 0, 0, 0], np.uint8)  # of geoms that rays meet
+_OTHER_GROUP = 5
 _LOCK_DAMPING = 1e7  # [N m s/rad or N s/m]; a motor of 100 N m moves such a joint by 1e-5 rad in a second
 
 
@@ -52,6 +55,7 @@ class MujocoBody(MujocoMotors):
     def bind(self) -> None:
         """Take the numbers of a newly compiled model."""
         parts = self.parts
+        self._surface: tuple[Any, Any] | None = None  # for rays, of `surface_heights`
         self.joint_low, self.joint_high = parts.low, parts.high
         self.link_names = [link for link in parts.links if link != self.base_name]
         self._base = parts.links[self.base_name]
@@ -161,6 +165,20 @@ class MujocoBody(MujocoMotors):
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build") from None
         return np.concatenate(halves, axis=-1)
 
+    def add_contact_sensor(self, link: str) -> None:
+        self.find_link(link)
+        self._sim.add_contact_sensor(f"{self.name}/{link}")
+
+    def touches(self, link: str) -> NDArray[np.bool_]:
+        try:
+            found = self._fields.sensor(f"{self.name}/{link} contacts")
+        except KeyError:
+            raise TaskError(
+                f"link {link!r} has no contact sensor: call add_contact_sensor({link!r}) in build"
+            ) from None
+        touching: NDArray[np.bool_] = found[..., 0] > 0
+        return touching
+
     def sensor(self, name: str) -> Array:
         check_name(name, self.sensor_names, f"{self.file.name} has no sensor", TaskError)
         return self._fields.sensor(f"{self.name}/{name}")
@@ -189,6 +207,34 @@ class MujocoBody(MujocoMotors):
                     links.append(own[one])
                     contacts.append(contact)
         return links, contacts
+
+    def surface_heights(self, places: Array) -> Array:
+        mujoco = self._sim.mujoco
+        model, data = self._find_surface()
+        top = float((data.geom_xpos[self.parts.geoms, 2] + model.geom_rbound[self.parts.geoms]).max()) + 1.0
+        down, met = np.array([0.0, 0.0, -1.0]), np.zeros(1, np.int32)
+        heights = np.zeros(places.shape[:-1])
+        for index in np.ndindex(heights.shape):
+            start = np.array([*places[index], top])
+            distance = mujoco.mj_ray(model, data, start, down, _SURFACE_GROUPS, True, -1, met)
+            if distance >= 0:
+                heights[index] = top - distance
+        return heights
+
+    def _find_surface(self) -> tuple[Any, Any]:
+        """Return a copy of the model in which rays meet this body only, and its data."""
+        if self._surface is None:
+            model = copy.copy(self._sim.model)
+            model.geom_group[:] = _OTHER_GROUP
+            model.geom_group[self.parts.geoms] = 0
+            model.geom_rgba[self.parts.geoms, 3], model.geom_matid[self.parts.geoms] = (
+                1.0,
+                -1,
+            )  # rays pass the invisible
+            data = self._sim.mujoco.MjData(model)
+            self._sim.mujoco.mj_kinematics(model, data)
+            self._surface = model, data
+        return self._surface
 
     def distance_to(self, other: Any, link: str | None = None) -> float:
         sim = self._single("distance_to")

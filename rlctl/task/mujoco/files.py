@@ -18,6 +18,7 @@ from rlctl.task.mujoco.world import import_mujoco
 from rlctl.task.urdf import Urdf, read_urdf
 
 _FEWEST_VERTICES = 4  # of a mesh in MuJoCo
+_GROUND = "ground"  # the body of a file that has none
 _FRICTION = 0.5  # PyBullet's, of a link whose file gives none
 
 
@@ -55,6 +56,8 @@ def read_model_file(
         raise TaskError(f"{path}: MuJoCo reads URDF and MJCF (.xml) files{first}")
     if path.suffix == ".xml":
         spec = _call_reader(path, lambda: import_mujoco().MjSpec.from_file(str(path)))
+        if spec.worldbody.first_body() is None:
+            spec = _put_into_body(spec)
         described = _describe_mjcf(path, _prepare_mjcf(spec))
         if not visuals:
             _delete_visuals(spec)
@@ -86,6 +89,15 @@ def _call_reader(path: Path, read: Callable[[], Any]) -> Any:
         return read()
     except ValueError as error:
         raise TaskError(f"MuJoCo cannot load {path}: {' '.join(str(error).split())}") from None
+
+
+def _put_into_body(spec: Any) -> Any:
+    """Return the spec of a file whose shapes are all of the world, such as terrain, with a body that has them."""
+    outer = import_mujoco().MjSpec()
+    outer.modelfiledir, outer.meshdir, outer.texturedir = spec.modelfiledir, spec.meshdir, spec.texturedir
+    ground = outer.worldbody.add_body(name=_GROUND)
+    outer.attach(spec, frame=ground.add_frame(), prefix=f"{_GROUND}/")
+    return outer
 
 
 def _prepare_mjcf(spec: Any) -> Any:

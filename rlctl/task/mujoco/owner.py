@@ -28,6 +28,9 @@ class BodyOwner(Protocol):
     def add_force_sensor(self, joint: str, link: str) -> None:
         """Measure the force in a joint."""
 
+    def add_contact_sensor(self, link: str) -> None:
+        """Count the contacts of a link."""
+
     def add_motors(self, body: str, motors: Mapping[str, Motor]) -> None:
         """Make motors of a body real ones, by joint."""
 

@@ -31,6 +31,7 @@ class Robot:
     ranges: Mapping[str, tuple[float, float]]  # lowest and highest position by joint [rad]
     links: tuple[str, ...]  # the base is the first
     has_armature: bool
+    sensors: tuple[str, ...] = ()  # of an MJCF file
     keyframe: str = ""  # name of the file's keyframe `home`, or of its first
     pose: Mapping[str, float] = dataclasses.field(default_factory=dict)  # [rad], of the keyframe
     gains: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
@@ -80,6 +81,7 @@ def read_robot(path: Path) -> Robot:
         },
         links=(body.base_name, *body.link_names),
         has_armature=bool(armature.any()),
+        sensors=tuple(body.sensor_names),
         keyframe=keyframe,
         pose=pose,
         gains=_read_gains(path),

@@ -71,8 +71,11 @@ class MujocoScene:
         source = read_model_file(find_model_file(file), fixed=fixed, inertia=inertia, visuals=self._visuals)
         child = source.spec
         if not floor:
-            for geom in list(child.worldbody.geoms):
-                child.delete(geom)
+            _delete_floor(child)
+            if child.worldbody.first_body() is None:
+                raise TaskError(f"{source.path}: it has no body that moves")
+        for key in list(child.keys):  # poses of this file alone, which nobody uses here
+            child.delete(key)
         for joint in child.joints:
             joint.actfrclimited = False  # the force limits are those of the motors
         is_urdf = source.path.suffix == ".urdf"
@@ -146,6 +149,17 @@ class MujocoScene:
         for name, kind in ((joint, kinds.mjSENS_FORCE), (f"{joint} torque", kinds.mjSENS_TORQUE)):
             self.spec.add_sensor(name=name, type=kind, objtype=self.mujoco.mjtObj.mjOBJ_SITE, objname=joint)
 
+    def add_contact_sensor(self, link: str) -> None:
+        """Count the contacts of a link, which is named "BODY/NAME", with anything else."""
+        mujoco = self.mujoco
+        sensor = self.spec.add_sensor(
+            name=f"{link} contacts",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            objname=link,
+        )
+        sensor.intprm[:3] = [1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND), 0, 1]  # what, of which, how many
+
     def compile(self, model: Any, data: Any) -> tuple[Any, Any]:
         """Return the model and its data, with the state and the changes of those that were compiled before.
 
@@ -157,6 +171,8 @@ class MujocoScene:
         except ValueError as error:
             newest = list(self.parts.values())[-1]  # those before it have been compiled
             raise TaskError(f"MuJoCo cannot load {newest.file.path}: {' '.join(str(error).split())}") from None
+        # A link without mass has its centre at its origin; MuJoCo puts it elsewhere.
+        new_model.body_ipos[new_model.body_mass == 0] = 0.0
         new_data = self.mujoco.MjData(new_model)
         _keep_changes(model, new_model)
         _keep_state(model, data, new_model, new_data)
@@ -243,6 +259,15 @@ class MujocoScene:
         origin = link.ipos if end.link == end.body.base_name else np.zeros(3)
         link.add_site(name=name, pos=origin + end.position, quat=[end.orientation[part] for part in _WXYZ])
         return name
+
+
+def _delete_floor(child: Any) -> None:
+    """Delete what a model file has besides its robot: shapes of the world, and bodies of it in which nothing moves."""
+    for geom in list(child.worldbody.geoms):
+        child.delete(geom)
+    for link in list(child.worldbody.bodies):
+        if not link.find_all("joint"):
+            child.delete(link)
 
 
 def _keep_changes(before: Any, after: Any) -> None:

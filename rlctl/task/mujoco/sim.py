@@ -180,6 +180,11 @@ class MujocoSim(Sim):
         self._scene.add_force_sensor(joint, link)
         self._compile()
 
+    def add_contact_sensor(self, link: str) -> None:
+        """Count the contacts of a link, which is named "BODY/NAME", with anything else."""
+        self._scene.add_contact_sensor(link)
+        self._compile()
+
     def add_motors(self, body: str, motors: Mapping[str, Motor]) -> None:
         """Make motors of a body real ones, by joint."""
         self._scene.add_motors(body, motors)

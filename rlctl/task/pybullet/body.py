@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Contacts, MassState, Vector
@@ -29,6 +30,7 @@ class PybulletBody(Properties):
         self._substeps, self._physics_dt = substeps, dt / substeps
         self._cache: dict[Any, Any] = {}
         self._force_sensors: set[str] = set()
+        self._contact_sensors: dict[str, int] = {}  # numbers of links
         infos = [
             pybullet.getJointInfo(body_id, index, physicsClientId=client)
             for index in range(pybullet.getNumJoints(body_id, physicsClientId=client))
@@ -97,6 +99,20 @@ class PybulletBody(Properties):
         if joint not in self._force_sensors:
             raise TaskError(f"joint {joint!r} has no force sensor: call add_force_sensor({joint!r}) in build")
         return np.array(pybullet.getJointState(self.id, self._joint_number(joint), physicsClientId=self.client)[2])
+
+    def add_contact_sensor(self, link: str) -> None:
+        if link == self.base_name and link not in self._links:
+            self._contact_sensors[link] = -1
+        else:
+            self._contact_sensors[link] = self._link_index(link)
+
+    def touches(self, link: str) -> NDArray[np.bool_]:
+        if link not in self._contact_sensors:
+            raise TaskError(f"link {link!r} has no contact sensor: call add_contact_sensor({link!r}) in build")
+        points = pybullet.getContactPoints(
+            bodyA=self.id, linkIndexA=self._contact_sensors[link], physicsClientId=self.client
+        )
+        return np.array(bool(points))
 
     def _joint_number(self, joint: str) -> int:
         check_name(joint, self.all_joint_names, f"{self.file.name} has no joint", TaskError)

@@ -93,6 +93,43 @@ def write_yaml(path, content):
     return path
 
 
+SCENE = """
+<mujoco>
+  <worldbody>
+    <body name="floor"><geom name="floor" type="plane" size="0 0 1"/></body>
+    <body name="base" pos="0 0 0.5">
+      <freejoint/>
+      <site name="imu"/>
+      <body name="trunk">
+        <geom name="trunk" type="box" size="0.1 0.1 0.05" mass="1" contype="0" conaffinity="0"/>
+        <body name="left" pos="0 0.1 -0.1">
+          <joint name="left_hip" axis="0 1 0" range="-1 1"/>
+          <geom type="box" size="0.1 0.03 0.05" mass="0.2"/>
+        </body>
+        <body name="right" pos="0 -0.1 -0.1">
+          <joint name="right_hip" axis="0 1 0" range="-1 1"/>
+          <geom type="box" size="0.1 0.03 0.05" mass="0.2"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <sensor><accelerometer site="imu" name="accelerometer"/></sensor>
+  <actuator>
+    <position joint="left_hip" kp="20" kv="1"/>
+    <position joint="right_hip" kp="20" kv="1"/>
+  </actuator>
+  <keyframe><key name="home" qpos="0 0 0.2 1 0 0 0 0 0"/></keyframe>
+</mujoco>
+"""
+
+
+def write_scene(folder):
+    """Write a robot as projects of MuJoCo have theirs: its base has no mass, and the floor is a body of the file."""
+    path = folder / "scene.xml"
+    path.write_text(SCENE)
+    return str(path)
+
+
 class Exported(torch.nn.Module):
     """A policy as exporters for TorchScript write it: a normaliser, an LSTM if it has one, and a perceptron."""
 

@@ -3,10 +3,12 @@
 import contextlib
 import dataclasses
 import itertools
+import pathlib
 import re
 
 import numpy as np
 import pytest
+import torch
 
 from rlctl.errors import ArtifactError, RecipeError, UsageError
 from rlctl.importing.foreign.import_policy import import_policy, import_to_play
@@ -24,6 +26,7 @@ from tests.importing.foreign.policies import (
     expect_as,
     read_walk,
     write_onnx,
+    write_scene,
     write_torchscript,
     write_yaml,
 )
@@ -104,6 +107,80 @@ def test_deploy_yaml_of_unitree_rl_lab_has_two_orders(run_import):
     assert (gyroscope.kind, gyroscope.scale, gyroscope.clip, gyroscope.history) == ("gyroscope", 0.2, (-10.0, 10.0), 2)
     assert dict(deployment.commands) == {"lin_vel_x": (-1.0, 1.0)}
     assert "joint_ids_map: guessed the order FR, FL, RR, RL of Unitree's quadrupeds" in imported.notes
+
+
+DESCRIPTORS = {  # as Isaac Lab writes them
+    "actions": [
+        {
+            "name": "joint_position_action",
+            "clip": None,
+            "joint_names": JOINTS,
+            "offset": STANCE,
+            "scale": 0.5,
+        }
+    ],
+    "articulations": {
+        "robot": {
+            "joint_names": JOINTS[::-1],
+            "default_joint_stiffness": [float(number) for number in range(1, 13)],
+            "default_joint_damping": [1.0] * 12,
+            "default_joint_armature": [0.0] * 12,
+        }
+    },
+    "observations": {
+        "policy": [
+            {"name": "base_lin_vel", "overloads": {"clip": None, "history_length": 0, "scale": None}},
+            {"name": "generated_commands", "overloads": {"scale": [2.0, 2.0, 0.25]}},
+            {"name": "joint_pos_rel", "joint_names": JOINTS, "joint_pos_offsets": STANCE},
+            {"name": "last_action", "overloads": {"clip": None, "history_length": 3}},
+        ]
+    },
+    "scene": {"decimation": 4, "dt": 0.02, "physics_dt": 0.005},
+}
+
+
+def test_io_descriptors_of_isaac_lab(run_import):
+    imported = run_import(DESCRIPTORS, 3 + 3 + 12 + 36)
+    deployment = imported.deployment
+    assert imported.form == "IO descriptors of Isaac Lab"
+    assert deployment.stiffness == tuple(float(number) for number in range(12, 0, -1))
+    assert (deployment.control_dt, deployment.physics_dt) == (0.02, 0.005)
+    assert deployment.observations[1].scale == (2.0, 2.0, 0.25)
+    assert deployment.history == {"last_action": 3}
+    assert deployment.action_scale == (0.5,) * 12
+
+
+def test_gains_of_explicit_actuators_are_asked_for(run_import):
+    robot = {**DESCRIPTORS["articulations"]["robot"], "default_joint_stiffness": [0.0] * 12}
+    content = {**DESCRIPTORS, "articulations": {"robot": robot}}
+    with pytest.raises(UsageError, match=r"does not say: stiffness\. Give --set stiffness=40"):
+        run_import(content, 54)
+    assert run_import(content, 54, {"stiffness": 30}).deployment.stiffness == (30.0,) * 12
+
+
+def test_a_command_that_is_no_velocity(run_import):
+    goal = {"policy": [{"name": "generated_commands", "shape": [4]}]}
+    with pytest.raises(
+        UsageError, match=r"generated_commands has 4 numbers.* policies that reach a goal are not imported"
+    ):
+        run_import({**DESCRIPTORS, "observations": goal}, 4)
+
+
+def test_leapp_is_refused_with_what_to_do(run_import):
+    content = {"models": {}, "pipeline": {}, "system information": {}}
+    with pytest.raises(UsageError, match=r"LEAPP, .* is not imported\ngive the policy\.onnx that Isaac Lab's"):
+        run_import(content, 45)
+
+
+def test_height_scan_of_isaac_lab(run_import):
+    observations = {**LAB["observations"], "height_scan": {"scale": [5.0] * 187, "clip": [-1.0, 1.0]}}
+    imported = run_import({**LAB, "observations": observations}, 48 + 187)
+    heights = imported.deployment.observations[-1]
+    assert (heights.kind, heights.shift, heights.clip, heights.scale) == ("heights", -0.5, (-1.0, 1.0), 5.0)
+    assert "scan: guessed 17 x 11 points, 0.1 m apart, as in Isaac Lab's velocity tasks" in imported.notes
+    pathlib.Path(imported.policy.path).unlink()
+    with pytest.raises(UsageError, match=r"heights 187\), and the network takes 148"):
+        run_import({**LAB, "observations": observations}, 148, name="other.yaml")
 
 
 def test_stiffness_follows_joint_ids_map(run_import):
@@ -200,7 +277,8 @@ def test_columns_of_histories():
         (GYM, 47, {"stifness": 1}, "a deployment has no 'stifness'. Did you mean 'stiffness'"),
         (LAB | {"observations": {"motion_command": {}}}, 24, None, "give the one it was trained with: --motion FILE"),
         (LAB | {"observations": {"motion_anchor_pos_b": {}}}, 48, None, "observes motion_anchor_pos_b, which is not"),
-        (LAB | {"observations": {"height_scan": {}}}, 48, None, "no known observation is 'height_scan'"),
+        (LAB | {"observations": {"pose_command": {}}}, 48, None, "policies that reach a goal are not imported"),
+        (LAB | {"observations": {"hight_scan": {}}}, 48, None, "no known observation is 'hight_scan'. Did you mean"),
         (LAB | {"joint_ids_map": [99] * 12}, 48, None, "joint_ids_map has the index 99, and there are 12 values"),
         (describe_walk(), 45, {"observations": 5}, "observations"),
         ({"a": 1}, 45, None, "in none of the known forms"),
@@ -360,6 +438,68 @@ def test_tags_of_python_are_not_constructed(run_import, tmp_path):
     assert imported.deployment.control_dt == 0.02
 
 
+DUCK = {  # as Open Duck's policies, of a smaller robot
+    "action_scale": 0.25,
+    "target_speed": 5.24,
+    "control_dt": 0.02,
+    "observations": [
+        {"kind": "gyroscope"},
+        {"kind": "accelerometer", "shift": [1.3, 0.0, 0.0]},
+        {"kind": "command"},
+        {"kind": "constant", "values": [0.5, -0.5], "scale": 2.0},
+        {"kind": "joint_positions"},
+        {"kind": "last_action", "history": 3},
+        {"kind": "targets", "relative": False},
+        {"kind": "contacts", "links": ["left", "right"]},
+    ],
+    "newest_first": True,
+    "commands": {"lin_vel_x": [-0.15, 0.15], "lin_vel_y": [-0.2, 0.2]},
+}
+
+
+def test_constants_become_part_of_the_network(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    size = 3 + 3 + 3 + 2 + 2 + 6 + 2 + 2
+    module = write_torchscript(tmp_path / "policy.pt", [size, 8, 2])
+    deploy = write_yaml(tmp_path / "deploy.yaml", DUCK)
+    imported = import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, write_scene(tmp_path)))
+    # Half of the fastest command, of 0.25 m/s.
+    assert imported.policy.info.spec.parameters["tolerance"] == 0.125
+    deployment = imported.deployment
+    assert (deployment.default_positions, deployment.target_speed) == ((0.0, 0.0), (5.24, 5.24))
+    seen = np.linspace(-1.0, 1.0, size - 2).astype(np.float32)  # rlctl's layout: the oldest action first
+    own = np.concatenate([seen[:9], [1.0, -1.0], seen[9:11], seen[15:17], seen[13:15], seen[11:13], seen[17:]])
+    expected = module(torch.tensor(own[None], dtype=torch.float32)).detach().numpy()[0]
+    acted = load_policy(imported.policy.path).predict(seen)
+    assert acted == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "contacts", "links": ["lefd"]}, r"scene\.xml has no link 'lefd'. Did you mean 'left'"),
+        ({"kind": "accelerometer", "sensor": "acc"}, r"scene\.xml has no sensor 'acc'"),
+        ({"kind": "constant"}, "observation 'constant' has no values"),
+        ({"kind": "phase", "period_s": 1.0, "shift": 1.0}, "observation 'phase' cannot be shifted"),
+    ],
+)
+def test_sensors_that_the_robot_lacks(tmp_path, changes, message):
+    write_torchscript(tmp_path / "policy.pt", [5, 8, 2])
+    content = {**DUCK, "observations": [{"kind": "joint_positions"}, changes]}
+    deploy = write_yaml(tmp_path / "deploy.yaml", content)
+    with pytest.raises(UsageError, match=message) as raised:
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, write_scene(tmp_path)))
+    assert str(raised.value).count("\n") < 3
+
+
+def test_an_accelerometer_needs_mjcf(tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [3, 8, 12])
+    content = describe_walk(observations=[{"kind": "accelerometer"}])
+    deploy = write_yaml(tmp_path / "deploy.yaml", content)
+    with pytest.raises(UsageError, match=r"a1\.urdf has no sensors; give an MJCF file with <accelerometer>"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, A1))
+
+
 def test_anchors_and_large_files_are_refused(tmp_path):
     write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
     bomb = tmp_path / "bomb.yaml"
@@ -372,6 +512,17 @@ def test_anchors_and_large_files_are_refused(tmp_path):
         file.truncate(10**9)
     with pytest.raises(ArtifactError, match="too large"):
         import_policy(tmp_path / "policy.pt", ForeignFiles(tmp_path / "large.yaml", A1))
+
+
+def test_models_that_are_no_robot(tmp_path):
+    write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
+    deploy = write_yaml(tmp_path / "deploy.yaml", describe_walk())
+    with pytest.raises(ArtifactError, match=r"--model: model file 'no\.xml' not found"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, "no.xml"))
+    floor = tmp_path / "floor.xml"
+    floor.write_text('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
+    with pytest.raises(UsageError, match=r"--model: .*floor\.xml: it has no body that moves"):
+        import_policy(tmp_path / "policy.pt", ForeignFiles(deploy, str(floor)))
 
 
 def test_other_files_are_refused(tmp_path):
