@@ -2,11 +2,14 @@
 
 import math
 
-from rlctl.policy.file import Score
-from rlctl.runs.tables import Rows
+from rlctl.errors import ArtifactError
+from rlctl.policy.file import PolicyFile, Score
+from rlctl.runs.directory import RunDirectory
+from rlctl.runs.tables import Rows, read_table
 
 _STANDARD_ERRORS = 1.645
 """A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
+_MUCH_NEWER = 0.1  # share of the last policy's steps that followed the last evaluation
 
 
 def is_lower(success: float, highest: float, episodes: float) -> bool:
@@ -44,3 +47,18 @@ def find_best_row(rows: Rows) -> dict[str, float | None] | None:
             best_row, best_score = row, score
         highest = max(highest, score.success or 0.0)
     return best_row
+
+
+def describe_unevaluated_last(run: RunDirectory) -> str | None:
+    """Return that a run's last policy is newer than its best and was never evaluated, and the option that plays it.
+
+    None where little training followed the last evaluation, and where a policy cannot be read.
+    """
+    try:
+        evaluated = [int(row["steps"] or 0) for row in read_table(run.evals_file)]
+        best, last = (PolicyFile.read_info(file).training_steps for file in (run.best_policy, run.last_policy))
+    except ArtifactError:
+        return None
+    if not evaluated or last <= best or last - evaluated[-1] < _MUCH_NEWER * last:
+        return None
+    return f"last is {last - best:,} steps newer than best and was never evaluated: --checkpoint last"

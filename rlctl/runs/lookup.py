@@ -17,6 +17,7 @@ from rlctl.hub import store
 from rlctl.output import format_duration
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.shipped import PRETRAINED, find_shipped_policy
+from rlctl.runs.best import describe_unevaluated_last
 from rlctl.runs.directory import GROUP_FILE, ROOT, TUNE_FILE, RunDirectory, is_group
 
 _MOST_COMPARED = 50  # older runs whose scores are looked at
@@ -143,7 +144,8 @@ def find_policy(text: str | None, which: str = "best", root: Path = ROOT) -> Fou
     """Return the policy that the argument RUN names, which may be a policy file.
 
     A task's name means its newest run that has such a policy; if `which` is `pretrained`, the policy that it ships.
-    A note warns if the task's source has changed since the training or the export, or if its engine is missing.
+    A note warns if the task's source has changed since the training or the export, if its engine is missing, and of a
+    run's best policy if a much newer one was never evaluated.
     """
     if text is not None and which != PRETRAINED and store.is_address(text):
         text = str(store.fetch(text))
@@ -163,6 +165,10 @@ def _list_warnings(policy: FoundPolicy) -> Iterator[str]:
         change = _describe_source_change(info.spec.task, digest, "this policy was exported")
     if change:
         yield f"warning: {change}; its score may have changed"
+    if policy.run is not None and policy.file == policy.run.best_policy:
+        unevaluated = describe_unevaluated_last(policy.run)
+        if unevaluated:
+            yield unevaluated
     if info is not None and info.spec.lacks_pybullet:
         yield "warning: trained in PyBullet, which is not installed, so MuJoCo simulates; scores may differ"
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rlctl.errors import ArtifactError, EpisodeFailed, Interrupted, TaskError
+from rlctl.runs.best import describe_unevaluated_last
 from rlctl.training import status
 from rlctl.training.checkpoints import Checkpoints
 from rlctl.training.display import Display
@@ -124,6 +125,9 @@ class TrainingLoop:
             state = "checkpoint saved"
         else:
             state = f"the last saved checkpoint{'' if saved_step is None else f', of step {saved_step:,},'} is intact"
+        unevaluated = describe_unevaluated_last(self.checkpoints.run)
+        if unevaluated:
+            self._display.message(unevaluated)
         raise Interrupted(
             f"interrupted at step {steps:,}; {state}. Resume with: {self._resume_command}", self.stop_signal
         )

@@ -140,7 +140,7 @@ def test_a_policy_file_itself(root, tmp_path):
 BOX = {"type": "Box", "low": "-1.0", "high": "1.0", "shape": [1], "dtype": "float32"}
 
 
-def give_policy(run, success=None, mean_return=0.0, steps=1000, parameters=None):
+def give_policy(run, success=None, mean_return=0.0, steps=1000, parameters=None, file=None):
     info = PolicyInfo(
         algo="ppo",
         policy="MlpPolicy",
@@ -149,8 +149,27 @@ def give_policy(run, success=None, mean_return=0.0, steps=1000, parameters=None)
         training_steps=steps,
         evaluation=Score(success=success, mean_return=mean_return),
     )
-    PolicyFile(info, {"policy/x": np.zeros(1)}).write(run.best_policy)
-    os.utime(run.best_policy, (1e9, 1e9))
+    file = file or run.best_policy
+    PolicyFile(info, {"policy/x": np.zeros(1)}).write(file)
+    os.utime(file, (1e9, 1e9))
+
+
+@pytest.mark.parametrize(
+    ("evaluated", "last", "note"),
+    [
+        ([40_960], 69_632, "last is 28,672 steps newer than best and was never evaluated: --checkpoint last"),
+        ([40_960, 69_632], 69_632, None),  # evaluated, and not better
+        ([40_960, 69_632], 71_680, None),  # hardly newer than what was not better
+    ],
+)
+def test_a_much_newer_policy_that_was_never_evaluated_is_named(root, make_run, evaluated, last, note):
+    run = make_run("reach", "2026-01-01_10-00-00_s0")
+    give_policy(run, success=0.04, steps=40_960)
+    give_policy(run, steps=last, file=run.last_policy)
+    rows = "".join(f"{steps},0.04,1.0\n" for steps in evaluated)
+    run.evals_file.write_text(f"steps,success,return\n{rows}")
+    assert find_policy(str(run.path), root=root).notes == (() if note is None else (note,))
+    assert find_policy(str(run.path), "last", root).notes == ()
 
 
 def test_a_task_stands_for_its_newest_run_with_a_policy(root, make_run, monkeypatch):

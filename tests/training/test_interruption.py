@@ -13,8 +13,10 @@ from typing import Any
 import psutil
 import pytest
 
+from rlctl.errors import Interrupted
+from rlctl.training.checkpoints import Checkpoints
 from tests import fork_server
-from tests.training.conftest import ENVS
+from tests.training.conftest import ENVS, TINY
 
 COMMAND = [sys.executable, "-m", "rlctl", "train"]
 SMALL = [
@@ -108,6 +110,22 @@ def test_a_signal_saves_a_checkpoint_and_leaves_no_child(start, rlctl, tmp_path,
     done = rlctl("train", "--resume", run, "-n", steps + 64, "--json", "-")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["steps"] == steps + 64
+
+
+def test_a_signal_names_the_last_policy_that_was_never_evaluated(train, every_boundary, monkeypatch, capsys):
+    original = Checkpoints.save
+
+    def save(checkpoints, *arguments):
+        saved = original(checkpoints, *arguments)
+        if checkpoints.saved_step == 32:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return saved
+
+    monkeypatch.setattr(Checkpoints, "save", save)
+    with pytest.raises(Interrupted, match="interrupted at step 64"):
+        train("Line", {**TINY, "eval": {"every_steps": 32, "episodes": 1}})
+    line = "last is 32 steps newer than best and was never evaluated: --checkpoint last\n"
+    assert line in capsys.readouterr().err
 
 
 @pytest.mark.slow
