@@ -21,6 +21,7 @@ from rlctl.recipe.sources import parse_settings, resolve
 from rlctl.runs.compare import maps as comparison_map
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.report import content, plots
+from rlctl.runs.report.show import describe_robustness
 from rlctl.runs.report.write import write_report
 from rlctl.storage import files
 from rlctl.training.status import find_recipe_changes
@@ -279,6 +280,21 @@ def test_options_without_effect_are_refused(group, options, message):
         write(group[0], **options)
 
 
+def test_scores_of_robustness_name_their_policy():
+    outcome = {"success_interval": (0.1, 0.9), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
+    axis = Axis(name="mass", setting="events.mass.factor", values=[0.6], nominal=1.0)
+    cell = Cell(values=[0.6], nominal=False, success_rate=0.3, **outcome)
+    result = Robustness(
+        task="reach", parameters={}, policy_file="runs/a/policies/last.safetensors", algo="ppo", training_steps=69_632,
+        episodes=20, seed=0, deterministic=True, nominal=Outcome(success_rate=0.88, **outcome),
+        maps=[RobustnessMap(axes=[axis], cells=[cell])],
+    )  # fmt: skip
+    assert list(describe_robustness(result)) == [
+        "worst cell, 20 episodes at mass 0.6: success 30.0%, return 1 (last.safetensors, step 69,632)",
+        "with nothing varied: success 88.0%, return 1 (last.safetensors, step 69,632)",
+    ]
+
+
 @pytest.mark.slow
 def test_robustness_is_in_it_where_it_was_measured(group):
     outcome = {"success_interval": (0.1, 0.9), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
@@ -293,7 +309,7 @@ def test_robustness_is_in_it_where_it_was_measured(group):
     )  # fmt: skip
     files.write_json(group[0] / "robustness.json", result.model_dump(mode="json"))
     page = write(group[0])
-    assert "worst cell, 20 episodes at mass 0.6: success 30.0%, return 1" in page
+    assert "worst cell, 20 episodes at mass 0.6: success 30.0%, return 1 (best, step 1)" in page
     assert "with nothing varied: success " in page
     (group[1] / "robustness.json").write_text("{")
     assert "robustness.json: damaged: " in write(group[1])

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from rich.filesize import decimal as format_bytes
@@ -12,6 +13,7 @@ from rlctl.errors import ArtifactError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.robustness import Robustness
 from rlctl.recipe.stages import format_value
+from rlctl.runs.best import describe_unevaluated_last
 from rlctl.runs.diagnosis.findings import diagnose, format_finding
 from rlctl.runs.diagnosis.history import RunHistory
 from rlctl.runs.directory import RunDirectory
@@ -37,6 +39,9 @@ class RunDescription(RunHistory):
         if change := describe_source_change(run):
             self.warnings.append(f"{change}: it was trained on another version of the task")
         self.summary = summarize(run.path)
+        unevaluated = describe_unevaluated_last(run)
+        if unevaluated and self.summary.state != "running":
+            self.warnings.append(unevaluated)
         self.findings = diagnose(self)
         self.robustness: Robustness | None = None  # what `rlctl eval --vary` or `--push` measured
         if run.robustness_file.is_file():
@@ -64,17 +69,23 @@ def _list_warnings(status: Mapping[str, Any]) -> Iterator[str]:
 
 
 def describe_robustness(result: Robustness) -> Iterator[str]:
-    """Yield lines about the worst cell of all maps and the nominal one, the push test, and the command."""
+    """Yield lines about the worst cell of all maps and the nominal one, the push test, and the command.
+
+    The scores name their policy: it need not be the one that the training's evaluations chose as the best.
+    """
+    policy = Path(result.policy_file).name
+    if not result.is_baseline:
+        policy = f"{policy}, step {result.training_steps:,}"
     if any(varied.played for varied in result.maps):
         place, worst = result.name_worst()
         where = f"worst cell, {result.episodes} episodes at {place}"
         for name, outcome in ((where, worst), ("with nothing varied", result.nominal)):
             rate = "" if outcome.success_rate is None else f"success {outcome.success_rate:.1%}, "
-            yield f"{name}: {rate}return {outcome.mean_return:.4g}"
+            yield f"{name}: {rate}return {outcome.mean_return:.4g} ({policy})"
     for line in result.list_failed():
         yield f"failed: {line}"
     if result.push is not None:
-        yield result.push.verdict
+        yield f"{result.push.verdict} ({policy})"
     if result.command:
         yield f"measured by: {result.command}"
 

@@ -132,14 +132,20 @@ def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> 
             for recipe in report.recipes
             for run in recipe.runs
         ],
-        "robustness": [
-            line for run in report.runs if run.robustness is not None for line in describe_robustness(run.robustness)
-        ],
+        "robustness": list(_describe_robustness(report)),
         "commands": content.list_commands(report),
         "recipe_name": report.recipes[0].name,
         "recipe": recipe,
     }
     return {**values, **_draw(report, pictures)} if is_html else values
+
+
+def _describe_robustness(report: RunReport) -> Iterator[str]:
+    for run in report.runs:
+        of_run = f"{run.summary.name}: " if len(report.runs) > 1 else ""
+        if run.robustness is not None:
+            for line in describe_robustness(run.robustness):
+                yield f"{of_run}{line}"
 
 
 def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, list[str]]], list[str]]:
