@@ -10,8 +10,11 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.exporting.c_source import find_compiler, write_c
 from rlctl.exporting.controller.export import export_controller
+from rlctl.exporting.controller.verify import Recorded, measure_limits_cost
 from rlctl.exporting.export_request import ExportRequest
 from rlctl.exporting.onnx_source import build
+from rlctl.play.collect import Episode
+from rlctl.play.messages import EpisodeResult
 from rlctl.policy.file import PolicyFile
 from tests.exporting import controlled
 from tests.exporting.controllers import make_policy
@@ -44,6 +47,20 @@ def policy_of(tmp_path):
     return write
 
 
+def test_the_cost_of_limits_is_one_line():
+    def record(number, success, total):
+        return Recorded([], [], Episode(EpisodeResult(0, number, total, 10, success, {}, None)))
+
+    free = [record(number, True, 90.0 + number) for number in range(30)]
+    limited = [record(number, number % 2 == 0, 50.0) for number in range(25)]
+    # Of the first 20: 90 + (0 + .. + 19) / 20 = 99.5.
+    assert str(measure_limits_cost(free, limited)) == (
+        "20 episodes: success in 20 without the limits, 10 within; mean return 99.5 without the limits, 50 within"
+    )
+    silent = [record(number, None, 1.0) for number in range(20)]
+    assert str(measure_limits_cost(silent, silent)) == "20 episodes: mean return 1 without the limits, 1 within"
+
+
 @pytest.mark.slow
 def test_both_files_are_verified_within_limits(policy_of, tmp_path):
     limits = tmp_path / "limits.yaml"
@@ -63,7 +80,10 @@ def test_both_files_are_verified_within_limits(policy_of, tmp_path):
     assert "A step took " in header
     assert " *   limits: {all: {speed: 0.2, acceleration: 1}}\n" in header
     words = [word for word, _ in in_c.list_rows()]
-    assert words == ["exported", "policy", "inputs", "target", "limits", "function", *words[6:]]
+    assert words == ["exported", "policy", "inputs", "target", "limits", "their cost", "function", *words[7:]]
+    cost = in_c.details["limits_cost"]
+    assert cost.mean_returns == (onnx.closed_loop.mean_return, in_c.closed_loop.mean_return)
+    assert "their cost" not in [word for word, _ in onnx.list_rows()]
     assert (tmp_path / "cart.onnx").exists()
     examples = [(tmp_path / name).read_text().splitlines() for name in ("cart.c.csv", "cart.onnx.csv")]
     assert examples[0][0] == "places_0,places_1,goal_0,goal_1,action_0,action_1,target_0,target_1"

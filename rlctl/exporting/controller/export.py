@@ -67,8 +67,10 @@ class ControllerReport(ExportReport):
         else:
             sizes = ", ".join(f"{name}[{size}]" for name, size in details["input_sizes"].items())
             rows = [*rows[:2], ("inputs", sizes), *rows[2:]]
+        cost = details.get("limits_cost")
+        costs = [] if cost is None else [("their cost", str(cost))]
         example = [("example", f"{path}: inputs and outputs of {ROWS} steps")] if (path := details["example"]) else []
-        return [*rows[:3], *target, ("limits", details["limits"]), *rows[3:-1], *example, *rows[-1:]]
+        return [*rows[:3], *target, ("limits", details["limits"]), *costs, *rows[3:-1], *example, *rows[-1:]]
 
 
 def export_controller(request: ExportRequest) -> list[ExportReport]:
@@ -149,6 +151,7 @@ class _Export:
         """Write and verify the C file and its header, with the limits."""
         source = ControllerSource(self.policy, self.plan, path.stem, self.limits, self.mapping)
         compiler, median, example = find_compiler(), None, None
+        cost = None
         command = os.environ.get("CC") or "cc"
         fields: dict[str, Any] = {"not_verified": f"there is no C compiler {command!r}; set CC to one"}
         code = source.write()
@@ -158,6 +161,8 @@ class _Export:
                     library = compile_controller(code, Path(folder), compiler)
                 controller = CController(self.plan, library, has_target=source.target is not None)
                 fields, recorded = self._verify(path, controller, source.target, is_limited=self.limits is not None)
+                if self.limits is not None:
+                    cost = verify.measure_limits_cost(self._record(is_limited=False), recorded)
                 median, longest = verify.measure_step(controller, recorded)
                 example = self._write_example(path, controller, recorded)
             code = source.write(
@@ -170,7 +175,7 @@ class _Export:
         size = len(code.source.encode()) + len(code.header.encode())
         limits = "the bounds of the action; --limits FILE adds others" if self.limits is None else str(self.limits.file)
         details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]}
-        details |= {"example": example, "limits": limits}
+        details |= {"example": example, "limits": limits, "limits_cost": cost}
         return self._report(path, size, details, source.target, median, fields)
 
     def _write_example(self, path: Path, controller: Controller, recorded: list[verify.Recorded]) -> Path:
@@ -184,7 +189,7 @@ class _Export:
         return actor if self.limits is None or not is_limited else self.player.limit(actor, self.limits)
 
     @functools.lru_cache(maxsize=2)  # noqa: B019 (for one export)
-    def _record(self, is_limited: bool) -> list[verify.Recorded]:
+    def _record(self, *, is_limited: bool) -> list[verify.Recorded]:
         return verify.record(self.player, self._make_reference(self.torch_actor, is_limited))
 
     def _check_conclusive(self, is_limited: bool, different: Sequence[int]) -> tuple[bool, bool]:
@@ -193,13 +198,13 @@ class _Export:
         )
         others = (self._make_reference(NumpyActor(policy), is_limited) for policy in changed)
         original = self._make_reference(self.torch_actor, is_limited)
-        return verify.check_conclusive(self.player, original, others, self._record(is_limited), different)
+        return verify.check_conclusive(self.player, original, others, self._record(is_limited=is_limited), different)
 
     def _verify(
         self, path: Path, controller: Controller, target: JointTarget | None, *, is_limited: bool
     ) -> tuple[dict[str, Any], list[verify.Recorded]]:
         """Return how a controller was verified, as fields of its report; raises `AnswerIsNo` if it acts differently."""
-        recorded = self._record(is_limited)
+        recorded = self._record(is_limited=is_limited)
         result = verify.verify_controller(self.player, recorded, MappedController(controller, self.mapping), target)
         agreement, loop = result.agreement, result.closed_loop
         if agreement.agrees and not loop.agrees:

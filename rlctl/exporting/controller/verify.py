@@ -14,6 +14,7 @@ from rlctl.environments.dict_spaces import take_row
 from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.registry import call_plugin
 from rlctl.errors import TaskError
+from rlctl.evaluation.episode_statistics import mean_return
 from rlctl.exporting.controller.controllers import CController, Controller, Inputs
 from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
 from rlctl.exporting.verify import (
@@ -175,6 +176,35 @@ def verify_controller(
             show(len(played))
     loop, different = compare_episodes(episodes, played), list_different(episodes, played)
     return ControllerAgreement(agreement, loop, None if target is None else worst, tuple(different))
+
+
+@dataclasses.dataclass(frozen=True)
+class LimitsCost:
+    """The same episodes of a policy without limits and within them."""
+
+    episodes: int
+    successes: tuple[int, int] | None  # without limits and within them; None if the task reports no success
+    mean_returns: tuple[float, float]
+
+    def __str__(self) -> str:
+        """Return the scores as one line."""
+        free, limited = self.mean_returns
+        returns = f"mean return {free:.5g} without the limits, {limited:.5g} within"
+        if self.successes is None:
+            return f"{self.episodes} episodes: {returns}"
+        succeeded, kept = self.successes
+        return f"{self.episodes} episodes: success in {succeeded} without the limits, {kept} within; {returns}"
+
+
+def measure_limits_cost(unlimited: Sequence[Recorded], limited: Sequence[Recorded]) -> LimitsCost:
+    """Compare the first `EPISODES` recorded episodes, of the same seeds, without limits and within them."""
+    both = [[episode.episode.result for episode in recorded[:EPISODES]] for recorded in (unlimited, limited)]
+    free, kept = both
+    successes = None
+    if any(result.success is not None for result in free):
+        successes = sum(bool(result.success) for result in free), sum(bool(result.success) for result in kept)
+    mean_returns = mean_return(free), mean_return(kept)
+    return LimitsCost(len(free), successes, mean_returns)
 
 
 def check_conclusive(
