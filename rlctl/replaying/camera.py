@@ -27,6 +27,8 @@ class Viewpoint:
     azimuth: float = -42.0  # [degrees] of the camera from the x axis, counterclockwise: at the right of a robot, ahead
     elevation: float = 22.0  # [degrees] above the horizontal
     zoom: float = 1.0  # 2: from half the distance
+    headroom: float = dataclasses.field(default=0.0, kw_only=True)
+    """Share of the picture's height, at its top, that is left free for text."""
 
     @property
     def direction(self) -> Array:
@@ -56,16 +58,19 @@ def read_viewpoint(text: str | None) -> Viewpoint:
 def find_distance(
     low: Array, high: Array, size: tuple[int, int], *, target: Array | None = None, view: Viewpoint | None = None
 ) -> float:
-    """Return the distance [m] to `target` from which a box fills the picture, by default to its centre.
+    """Return the distance [m] to `target` from which a box fills the picture below its headroom.
 
-    `low` and `high` are its corners [m]; `size` is width and height of the picture.
+    `low` and `high` are its corners [m]; `target` is by default its centre. `size` is width and height of the picture.
     """
-    axes = look_along(-(view or Viewpoint()).direction)
+    view = view or Viewpoint()
+    axes = look_along(-view.direction)
     middle = (low + high) / 2 if target is None else target
     corners = np.array(list(itertools.product(*np.stack([low, high], axis=1)))) - middle
     across, up, depth = axes @ corners.T
     slope = math.tan(math.radians(FIELD_OF_VIEW) / 2)
-    needed = _MARGIN * np.maximum(abs(up) / slope, abs(across) / (slope * size[0] / size[1])) - depth
+    needed = (
+        _MARGIN * np.maximum(abs(up) / (slope * (1 - view.headroom)), abs(across) / (slope * size[0] / size[1])) - depth
+    )
     return max(_CLOSEST, float(needed.max()))
 
 
@@ -93,5 +98,9 @@ class FilmCamera:
             self._target[2] = min(max(self._target[2], middle - room), middle + room)
         needed = find_distance(low, high, self._size, target=self._target, view=self._view)
         self._distance = max(self._distance, min(needed, self._farthest))
-        eye = self._target + self._distance / self._view.zoom * self._view.direction
-        return eye.tolist(), self._target.tolist()
+        distance = self._distance / self._view.zoom
+        # Looking higher by half of the headroom, what is seen is in the middle of the rest.
+        _, up, _ = look_along(-self._view.direction)
+        slope = math.tan(math.radians(FIELD_OF_VIEW) / 2)
+        middle = self._target + self._view.headroom * slope * distance * up
+        return (middle + distance * self._view.direction).tolist(), middle.tolist()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rlctl.replaying.camera import FIELD_OF_VIEW
 from rlctl.task.body import Body
-from rlctl.task.commands import name_for_people
+from rlctl.task.commands import CommandTerm, name_for_people
 from rlctl.task.env import TaskEnv
 from rlctl.task.rotations import look_along, roll_pitch_yaw
 
@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 _RING_RADIUS = 0.05  # [m], of the ring around a marker, whose sphere a hand may hide
 _LINES = 26  # lines of text that would fill the height of a picture
+_SPACING = 1.3  # between lines, relative to the size of the font
 _AVERAGED_S = 0.5  # [s] over which a measured velocity is averaged: a gait swings about it
 _RING_COLOR = (20, 170, 70)
 _TEXT = {"fill": (255, 255, 255), "stroke_fill": (35, 40, 48)}
@@ -54,7 +55,7 @@ def annotate(picture: Picture, markers: Mapping[str, Any], look: CameraPose, lin
         return picture
     from PIL import Image, ImageDraw
 
-    image, font_size = Image.fromarray(np.ascontiguousarray(picture)), max(9, height // _LINES)
+    image, font_size = Image.fromarray(np.ascontiguousarray(picture)), _choose_font_size(height)
     draw = ImageDraw.Draw(image)
     line_width = max(1, height // 240)
     for name, place in places.items():
@@ -66,8 +67,13 @@ def annotate(picture: Picture, markers: Mapping[str, Any], look: CameraPose, lin
         draw.ellipse(box, outline=_RING_COLOR, width=line_width)
         _write(draw, (column + 1.2 * radius, row - font_size), name, font_size)
     for number, line in enumerate(lines):
-        _write(draw, (font_size / 2, font_size * (0.4 + 1.3 * number)), line, font_size)
+        _write(draw, (font_size / 2, font_size * (0.4 + _SPACING * number)), line, font_size)
     return np.asarray(image)
+
+
+def _choose_font_size(height: int) -> int:
+    """Return the size of text in a picture of a height; both in pixels."""
+    return max(9, height // _LINES)
 
 
 class Caption:
@@ -83,19 +89,26 @@ class Caption:
         """Forget the velocities of the episode before."""
         self._measured.clear()
 
+    def find_headroom(self, height: int) -> float:
+        """Return the share of a picture of `height` [pixels] that its lines cover; the time alone is in a corner."""
+        count = len(self._list_commands())
+        return 0.0 if count == 0 else (1 + count) * _SPACING * _choose_font_size(height) / height
+
     def list_lines(self, time_s: float) -> list[str]:
         """Return the lines at a time [s] since the reset."""
         measured = self._average(time_s)
-        shown = self._env.markers()
         lines = [f"{time_s:.2f} s"]
-        for name, command in self._env.commands().items():
-            if name.rpartition("_")[0] in shown:  # a coordinate of a marker, which is drawn
-                continue
+        for name, command in self._list_commands().items():
             line = f"{name_for_people(name)}: commanded {float(command.value):+.2f}"
             if name in measured:
                 line += f", measured {measured[name]:+.2f}"
             lines.append(f"{line} {command.unit}".rstrip())
         return lines
+
+    def _list_commands(self) -> dict[str, CommandTerm]:
+        """Return the commands without coordinates of markers, which are drawn."""
+        shown = self._env.markers()
+        return {name: command for name, command in self._env.commands().items() if name.rpartition("_")[0] not in shown}
 
     def _average(self, time_s: float) -> dict[str, float]:
         """Return the robot's velocities in its heading frame, averaged over the pictures of the last half second."""

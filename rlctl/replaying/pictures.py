@@ -184,7 +184,8 @@ class _Film:
         """With `still` only this step is drawn, with `longest_s` [s] only the beginning of each episode."""
         self._still = still
         self._size = size
-        self._view = look_at(env, *(size or _SIZE[path.suffix]), viewpoint)
+        width, self._height = size or _SIZE[path.suffix]
+        self._view = look_at(env, width, self._height, viewpoint)
         inner = env.unwrapped
         self._caption = Caption(inner) if isinstance(inner, TaskEnv) else None
         self._step = 0
@@ -208,8 +209,9 @@ class _Film:
             self._take()
 
     def _begin(self) -> None:
+        headroom = 0.0 if self._caption is None else self._caption.find_headroom(self._height)
         try:
-            self._view.begin()
+            self._view.begin(headroom)
         except UsageError as error:
             raise UsageError(f"--video: no pictures: {error}") from None
         if self._caption is not None:

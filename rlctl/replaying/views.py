@@ -1,5 +1,6 @@
 """Where the pictures of an environment come from: a camera in its PyBullet world, or the environment itself."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -32,8 +33,8 @@ class _PlainView:
         self._size, self._viewpoint = size, viewpoint
         self._reason = env.no_pictures if isinstance(env, DrawableEnv) else ""
 
-    def begin(self) -> None:
-        """Prepare for a new episode."""
+    def begin(self, headroom: float = 0.0) -> None:
+        """Prepare for a new episode; a camera in a task's world leaves `headroom` free, as in `Viewpoint`."""
         self._camera = self._place_camera() if self._reason else None
         if self._reason and self._camera is None:
             raise UsageError(self._reason)
@@ -65,6 +66,10 @@ class _PlainView:
         return np.ascontiguousarray(picture[:height, :width].astype(np.uint8))
 
 
+def _leave(headroom: float, viewpoint: Viewpoint) -> Viewpoint:
+    return dataclasses.replace(viewpoint, headroom=headroom)
+
+
 class _TaskView:
     """A camera in a task's PyBullet world."""
 
@@ -72,12 +77,12 @@ class _TaskView:
         self._env = env
         self._size, self._viewpoint = size, viewpoint
 
-    def begin(self) -> None:
+    def begin(self, headroom: float = 0.0) -> None:
         sim, markers = self._env.sim, self._env.markers()
         assert isinstance(sim, PybulletSim)  # `look_at` asks
         bodies = [read_body(sim.client, body.id) for body in sim.bodies.values()]
         points = [np.asarray(position) for position in markers.values()]
-        self._camera = BulletCamera(bodies, points, self._size, self._viewpoint)
+        self._camera = BulletCamera(bodies, points, self._size, _leave(headroom, self._viewpoint))
 
     def draw(self, lines: Sequence[str] = ()) -> Picture:
         self._env.move_markers()
@@ -92,7 +97,7 @@ class _MujocoTaskView:
         self._env = env
         self._size, self._viewpoint = size, viewpoint
 
-    def begin(self) -> None:
+    def begin(self, headroom: float = 0.0) -> None:
         sim = self._env.sim
         assert isinstance(sim, MujocoSim)  # `look_at` asks
         bodies = list(sim.bodies.values())
@@ -103,7 +108,7 @@ class _MujocoTaskView:
             low, high = find_mujoco_bounds(sim, self._moving, markers)
         else:
             low, high = find_mujoco_bounds(sim, [self._followed], [])
-        self._camera = FilmCamera(low, high, self._size, self._viewpoint)
+        self._camera = FilmCamera(low, high, self._size, _leave(headroom, self._viewpoint))
         self._floor = find_missing_floor(sim)
 
     def draw(self, lines: Sequence[str] = ()) -> Picture:

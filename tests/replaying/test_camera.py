@@ -1,5 +1,6 @@
 """The camera of films: it holds what moves, follows stairs and not a gait, and looks from where it is told to."""
 
+import itertools
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from rlctl.errors import UsageError
 from rlctl.replaying.camera import FIELD_OF_VIEW, FilmCamera, Viewpoint, read_viewpoint
+from rlctl.replaying.captions import CameraPose
 from rlctl.replaying.replay import run_replay
 from rlctl.replaying.replay_request import ReplayRequest
 
@@ -34,6 +36,17 @@ def test_all_that_moves_stays_in_the_picture(text):
         assert is_seen(high, eye, target)
     away = math.dist(eye, target)
     assert math.dist(*camera.aim(LOW, HIGH)) == away  # it comes no nearer again: a film that breathes is hard to watch
+
+
+@pytest.mark.parametrize("headroom", [0.0, 0.1, 0.25])
+def test_text_has_room_above_what_is_seen(headroom):
+    size, box = (640, 480), np.array([[-0.2, -0.2, 0.0], [0.2, 0.2, 1.6]])
+    pose = CameraPose(*FilmCamera(*box, size, Viewpoint(headroom=headroom)).aim(*box))
+    corners = np.array(list(itertools.product(*box.T)))
+    rows = [pose.project(corner, size)[1] for corner in corners]
+    assert headroom * size[1] < min(rows)
+    assert min(rows) < headroom * size[1] + 0.15 * size[1]
+    assert max(rows) < size[1]
 
 
 def test_what_falls_for_ever_is_not_followed():

@@ -39,7 +39,9 @@ def test_a_walking_robot_names_commanded_and_measured_velocities():
         caption.begin()
         time_line, command_line = caption.list_lines(1.5)
         command = float(inner.commands()["lin_vel_x"].value)
+        headroom = caption.find_headroom(480)
     assert time_line == "1.50 s"
+    assert headroom == pytest.approx(2 * 1.3 * 18 / 480)  # two lines of 18 pixels
     assert command_line.startswith(f"velocity forwards: commanded {command:+.2f}, measured ")
     assert command_line.endswith(" m/s")
 
@@ -53,6 +55,7 @@ def test_coordinates_of_a_marker_are_drawn_and_not_written():
     with contextlib.closing(EnvSpec("reach").make("rgb_array")) as env:
         env.reset(seed=1)
         assert Caption(env.unwrapped).list_lines(0.25) == ["0.25 s"]
+        assert Caption(env.unwrapped).find_headroom(480) == 0.0
 
 
 def test_lines_are_in_the_corner():
