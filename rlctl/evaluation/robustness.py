@@ -77,6 +77,11 @@ class Axis(_Content):
     nominal: float | None  # the value in the unchanged world; None if it is not a single number
     whole: bool = False  # whether only whole numbers are possible
 
+    @property
+    def label(self) -> str:
+        """What the values are: the parameter of an event (`mass.factor`), or of the task (`tolerance`)."""
+        return self.name if self.setting == SIM else self.setting.partition(".")[2]
+
 
 class RobustnessMap(_Content):
     """One or two axes varied together; everything else is nominal."""

@@ -300,7 +300,10 @@ def test_robustness_is_in_it_where_it_was_measured(group):
     outcome = {"success_interval": (0.1, 0.9), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
     axis = Axis(name="mass", setting="events.mass.factor", values=[0.6, 1.0], nominal=1.0)
     cells = [Cell(values=[value], nominal=value == 1, success_rate=value / 2, **outcome) for value in axis.values]
-    grid = [Axis(name=name, setting=name, values=[1.0, 2.0], nominal=1.0) for name in ("mass", "friction")]
+    grid = [
+        Axis(name=name, setting=f"events.{name}.factor", values=[1.0, 2.0], nominal=1.0)
+        for name in ("mass", "friction")
+    ]
     pairs = [Cell(values=[a, b], nominal=a == b == 1, success_rate=0.5, **outcome) for a in (1, 2) for b in (1, 2)]
     result = Robustness(
         task="reach", parameters={}, policy_file="best", algo="ppo", training_steps=1, episodes=20, seed=0,
@@ -313,8 +316,8 @@ def test_robustness_is_in_it_where_it_was_measured(group):
     assert "with nothing varied: success " in page
     (group[1] / "robustness.json").write_text("{")
     assert "robustness.json: damaged: " in write(group[1])
-    assert 'aria-label="Success rate by mass"' in page
-    assert 'aria-label="Success rate by mass and friction"' in page
+    assert 'aria-label="Success rate by mass.factor"' in page
+    assert 'aria-label="Success rate by mass.factor and friction.factor"' in page
 
 
 def test_markdown_is_printed_for_pull_requests(group, rlctl):
@@ -457,6 +460,31 @@ def test_difference_of_two_maps():
     assert [cell["intervals_overlap"] for cell in cells] == [False, True, False, True]
     assert plots.draw_differences(result, "png").startswith(b"\x89PNG")
     assert b"two minus one" in plots.draw_differences(result, "svg")
+
+
+def test_many_maps_are_a_grid_with_room_for_their_numbers():
+    scores = {"success_rate": 0.5, "success_interval": (0.4, 0.6), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
+    settings = {"events.mass.factor": 1.0, "events.noise.std": 0.002, "events.late.steps": 3.0, "task.tolerance": 0.05}
+    maps = []
+    for setting, highest in settings.items():
+        values = np.linspace(0.0, highest, 5).tolist()
+        axis = {"name": setting.split(".")[1], "setting": setting, "values": values, "nominal": 0.0}
+        cells = [{"values": [value], "nominal": value == 0, **scores} for value in values]
+        maps.append({"axes": [axis], "cells": cells})
+    measured = make_measured([0.5] * 4).model_copy(
+        update={"maps": [RobustnessMap.model_validate(content) for content in maps]}
+    )
+    svg = plots.draw_maps(measured, "svg").decode()
+    width, height = (float(re.search(rf'{side}="([\d.]+)pt"', svg)[1]) for side in ("width", "height"))
+    assert (width, height) == pytest.approx((2 * 4.4 * 72, 2 * 2.7 * 72))
+    for label in ("mass.factor", "noise.std", "late.steps", "tolerance"):
+        assert f">{label}</text>" in svg
+    numbers = re.findall(r">([\d.]+)</text>", svg)
+    assert {"0.0005", "0.02", "3"} <= set(numbers)
+    assert len(numbers) <= 4 * 7
+    assert max(map(len, numbers)) <= len("0.0005")
+    difference = plots.draw_differences(comparison_map.subtract(("one", "two"), measured, measured), "svg")
+    assert b"reach: the same 10 episodes in every cell" in difference
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentFormatter
 from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
@@ -36,6 +36,9 @@ _STYLE: dict[Any, Any] = {
     "grid.alpha": 0.3,
 }
 Picture = Literal["svg", "pdf", "png"]
+_MOST_IN_A_ROW = 3  # panels
+_MOST_TICKS = 7  # of an axis
+_MOST_NUMBERS = 12  # next to each other in a row of cells
 _PNG_RESOLUTION = 200  # [dots per inch]
 _UNDATED: dict[Picture, dict[Any, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}
 _FEW = 8  # evaluations; fewer make no curve, and the training's is drawn too
@@ -144,24 +147,29 @@ def choose_form(path: Path) -> Picture:
 
 
 def draw_maps(result: Robustness, form: Picture) -> bytes:
-    """Return the robustness maps of a policy, next to each other, as a picture."""
+    """Return the robustness maps of a policy, in a grid, as a picture."""
     title = f"{result.task}: {Path(result.policy_file).name}, {result.episodes:,} episodes in every cell"
     return _draw_panels([functools.partial(_draw_map, varied=varied) for varied in result.maps], form, title)
 
 
 def draw_differences(result: MapComparison, form: Picture) -> bytes:
-    """Return the maps of the difference of two policies, next to each other, as a picture."""
+    """Return the maps of the difference of two policies, in a grid, as a picture."""
+    title = f"{result.task}: the same {result.episodes:,} episodes in every cell"
     panels = [functools.partial(_draw_difference, names=result.names, compared=compared) for compared in result.maps]
-    return _draw_panels(panels, form)
+    return _draw_panels(panels, form, title)
 
 
-def _draw_panels(panels: Sequence[Callable[[Figure, Axes], None]], form: Picture, title: str = "") -> bytes:
+def _draw_panels(panels: Sequence[Callable[[Figure, Axes], None]], form: Picture, title: str) -> bytes:
+    columns = min(math.ceil(math.sqrt(len(panels))), _MOST_IN_A_ROW)
+    rows = math.ceil(len(panels) / columns)
     with matplotlib.rc_context(_STYLE):
-        figure, file = Figure(figsize=(len(panels) * _SIZE[0], _SIZE[1]), layout="constrained"), io.BytesIO()
-        if title:
-            figure.suptitle(textwrap.fill(title, 60 * len(panels)), fontsize=9)
-        for draw, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
+        figure, file = Figure(figsize=(columns * _SIZE[0], rows * _SIZE[1]), layout="constrained"), io.BytesIO()
+        figure.suptitle(textwrap.fill(title, 60 * columns), fontsize=9)
+        grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        for draw, axes in zip(panels, grid, strict=False):
             draw(figure, axes)
+        for axes in grid[len(panels) :]:
+            axes.remove()
         _save(figure, file, form)
     return file.getvalue()
 
@@ -177,7 +185,8 @@ def _draw_difference(figure: Figure, axes: Axes, names: tuple[str, str], compare
         axes.plot(axis.values, values, marker="o", ms=3, mfc="white")
         axes.plot(np.array(axis.values)[clear], values[clear], "o", ms=4, color="C0", label="intervals do not overlap")
         axes.legend(loc="best", **_LEGEND)
-        _label(axes, axis.name, unit, title)
+        _label(axes, axis.label, unit, title)
+        _mark_values(axes, whole=axis.whole)
         return
     rows, columns = compared.axes
     largest = 1.0 if compared.has_success else float(np.abs(values).max()) or 1.0
@@ -186,7 +195,7 @@ def _draw_difference(figure: Figure, axes: Axes, names: tuple[str, str], compare
     for index in np.flatnonzero(clear):  # above the number of the cell
         place = index % len(columns.values), index // len(columns.values) + 0.3
         axes.plot(*place, marker="*", ms=6, color="black")
-    _label(axes, columns.name, rows.name, title)
+    _label(axes, columns.label, rows.label, title)
 
 
 def _draw_learning(axes: Axes, curves: Sequence[_Curves], column: str, *, for_paper: bool = False) -> bool:
@@ -275,7 +284,7 @@ def _draw_map(figure: Figure, axes: Axes, varied: RobustnessMap) -> None:
         if cell.nominal:
             corner = index % len(columns.values) - 0.46, index // len(columns.values) - 0.46
             axes.add_patch(Rectangle(corner, 0.92, 0.92, fill=False, edgecolor="white", linewidth=1.5))
-    _label(axes, columns.name, rows.name, f"{_TITLES[quantity]} by {rows.name} and {columns.name}")
+    _label(axes, columns.label, rows.label, f"{_TITLES[quantity]} by {rows.label} and {columns.label}")
 
 
 def _draw_heat(
@@ -292,10 +301,26 @@ def _draw_heat(
     axes.grid(False)
     grid = values.reshape(len(rows.values), len(columns.values))
     image = axes.imshow(grid, origin="lower", aspect="auto", **limits)
-    axes.set_xticks(range(len(columns.values)), [f"{value:g}" for value in columns.values])
-    axes.set_yticks(range(len(rows.values)), [f"{value:g}" for value in rows.values])
-    _write_cells(axes, image, grid, form or "{x:.3g}")
+    axes.set_xticks(*_choose_ticks(columns))
+    axes.set_yticks(*_choose_ticks(rows))
+    if grid.shape[1] <= _MOST_NUMBERS:
+        _write_cells(axes, image, grid, form or "{x:.3g}")
     figure.colorbar(image, ax=axes, label=unit, format=form)
+
+
+def _choose_ticks(axis: Axis) -> tuple[list[int], list[str]]:
+    """Return which values of an axis are marked, and their texts: more would overlap."""
+    marked = list(range(0, len(axis.values), math.ceil(len(axis.values) / _MOST_TICKS)))
+    return marked, [_format_tick(axis.values[index]) for index in marked]
+
+
+def _mark_values(axes: Axes, *, whole: bool) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(_MOST_TICKS - 1, steps=[1, 2, 5, 10], integer=whole))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _format_tick(value)))
+
+
+def _format_tick(value: float) -> str:
+    return f"{value:.3g}"
 
 
 def _write_cells(axes: Axes, image: AxesImage, grid: NDArray[np.float64], form: str) -> None:
@@ -320,7 +345,8 @@ def _draw_varied(axes: Axes, result: RobustnessMap, quantity: str) -> None:
         axes.legend(loc="best", **_LEGEND)
     if quantity == "success":
         _scale_rates(axes)
-    _label(axes, axis.name, _UNITS[quantity], f"{_TITLES[quantity]} by {axis.name}")
+    _label(axes, axis.label, _UNITS[quantity], f"{_TITLES[quantity]} by {axis.label}")
+    _mark_values(axes, whole=axis.whole)
 
 
 def plot_push(test: PushTest) -> str:
