@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from rlctl.arguments import choose_checkpoint, command
-from rlctl.errors import ArtifactError
+from rlctl.errors import ArtifactError, UsageError
 from rlctl.options import Argument, Json, SimOption
 from rlctl_robot.diagnose.diagnose_request import DiagnoseRequest
 
@@ -32,7 +32,7 @@ def diagnose(
     from rlctl import output
     from rlctl.arguments import parse_changes
     from rlctl_robot.diagnose.diagnose import diagnose_log
-    from rlctl_robot.diagnose.report import show
+    from rlctl_robot.diagnose.report import show, write_mapping
     from rlctl_robot.diagnose.source import find_source
 
     if log is not None and not log.exists():
@@ -42,6 +42,8 @@ def diagnose(
     )
     output.print_notes(source.notes)
     if log is None:
+        if request.output is not None:
+            raise UsageError("--output: there is no log, and so no mapping of a program to correct: leave it out")
         _diagnose_deployment(source, request.seed, json)
         return
     result = diagnose_log(
@@ -56,6 +58,8 @@ def diagnose(
     )
     output.print_notes(result.notes)
     show(result, json)
+    if request.output is not None:
+        write_mapping(result, request.output)
     result.check()
 
 

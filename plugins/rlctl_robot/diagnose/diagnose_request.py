@@ -30,4 +30,8 @@ class DiagnoseRequest:
     limits: Annotated[Path | None, Option("Limits with which the program has run (limits.yaml).", metavar="FILE")] = (
         None
     )
+    output: Annotated[
+        Path | None,
+        Option("Write the corrected mapping, for export --controller --mapping.", ("--output", "-o"), metavar="FILE"),
+    ] = None
     seed: Annotated[int, Option("Seed of the rollouts in simulation.", min=0)] = 0

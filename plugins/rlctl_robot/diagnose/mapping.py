@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
+import pydantic
 
 from rlctl.storage.validation import Number, Section, Whole
 from rlctl.task.joints import Joints
@@ -25,6 +26,15 @@ class TermMapping(Section):
     """Control steps by which the value is late; a program must find out why."""
     frame: str | None = None
     """`to body` or `to world`: the vector must be turned into this frame."""
+
+    @pydantic.model_serializer(mode="wrap")
+    def _shorten(self, serialize: pydantic.SerializerFunctionWrapHandler) -> dict[str, object]:
+        """Write one number for equal ones."""
+        content: dict[str, object] = serialize(self)
+        for key, values in (("scale", self.scale), ("offset", self.offset)):
+            if values and len(set(values)) == 1:
+                content[key] = values[0]
+        return content
 
 
 class LogMapping(Section):

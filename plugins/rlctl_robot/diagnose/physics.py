@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl import output
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.task.body import Body
@@ -109,13 +110,15 @@ class Physics:
     def _simulate(self, parts: Sequence[tuple[LoggedSignals, int]], rows: int) -> Array:
         """Return the errors of the predictions, shape (parts, rows - settling - 1, compared elements)."""
         found = []
-        for begin in range(0, len(parts), _WORLDS):
-            some = [*parts[begin : begin + _WORLDS]]
-            count = len(some)
-            some += [some[-1]] * (_WORLDS - count)
-            observations = np.stack([log.observations[start : start + rows] for log, start in some], axis=1)
-            actions = np.stack([log.actions[start : start + rows] for log, start in some], axis=1)
-            found.append(self._follow(observations, np.clip(actions, self._low, self._high))[:count])
+        with output.show_progress("simulating parts of the log", len(parts), "parts") as show:
+            for begin in range(0, len(parts), _WORLDS):
+                show(begin)
+                some = [*parts[begin : begin + _WORLDS]]
+                count = len(some)
+                some += [some[-1]] * (_WORLDS - count)
+                observations = np.stack([log.observations[start : start + rows] for log, start in some], axis=1)
+                actions = np.stack([log.actions[start : start + rows] for log, start in some], axis=1)
+                found.append(self._follow(observations, np.clip(actions, self._low, self._high))[:count])
         return np.concatenate(found)
 
     def _follow(self, observations: Array, actions: Array) -> Array:

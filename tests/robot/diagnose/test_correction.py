@@ -19,7 +19,7 @@ from rlctl_robot.diagnose.diagnose import (
     _mark_weak,
 )
 from rlctl_robot.diagnose.mapping import build_mapping, compose, invert
-from rlctl_robot.diagnose.report import describe_answers, describe_mapping
+from rlctl_robot.diagnose.report import describe_answers, describe_mapping, describe_verdict, write_mapping
 from rlctl_robot.diagnose.signals import LoggedSignals, shift
 
 ARM = Joints(["a", "b", "c"], default_positions=[0.1, 0.5, 0.0], action_scale=[0.2, 0.4, 1.0], measured="q")
@@ -88,7 +88,7 @@ def test_mistakes_of_the_log_alone_do_not_change_what_a_program_must_do():
     mapping = build_mapping([everything], [SWAP], {"q": 3, "v": 1}).model_dump(exclude_defaults=True)
     assert mapping == {
         "observations": {"q": {"order": [1, 0, 2]}},
-        "log": {"observations": {"q": {"scale": [2.0, 2.0, 2.0]}, "v": {"scale": [3.0], "offset": [1.0]}}},
+        "log": {"observations": {"q": {"scale": 2.0}, "v": {"scale": 3.0, "offset": 1.0}}},
     }
 
 
@@ -180,7 +180,7 @@ def test_a_unit_of_measured_angles_has_no_offset_for_a_controller():
     degree, pose = np.pi / 180, np.array(ARM.default_positions)
     unit = Correction("q", "unit", "", factor=(degree,) * 3, offset=tuple((degree - 1) * pose))
     of_controller = build_mapping([], [unit], {"q": 3}, ARM, is_of_controller=True).observations["q"]
-    assert of_controller.model_dump(exclude_defaults=True) == {"scale": [0.017453] * 3}
+    assert of_controller.model_dump(exclude_defaults=True) == {"scale": 0.017453}
 
 
 def test_a_controllers_program_gets_one_mapping_of_what_it_sends():
@@ -211,11 +211,59 @@ def test_what_decided_is_what_is_printed():
     found = [make_finding(0.9, 900.0)]
     worse = make_diagnosis(Answers(0.0, 0.0, {"q": (1.0, 1.2)}, (1.35, 1.43)), build_mapping([], [], {}), found)
     lines = describe_answers(worse)
-    assert lines[1] == "2. are the observations those of the simulation? yes"
+    assert lines[1] == "2. are the observations those of the simulation? yes"  # the finding has no correction
     assert lines[2].endswith("errors are 1.35 times the usual ones")
     simulated = dataclasses.replace(worse.answers, simulated_error=(3.2, 0.8))
     line = describe_answers(dataclasses.replace(worse, answers=simulated))[2]
-    assert line.endswith("errors are 3.2 times those of the worst sound robot, row by row, 0.8 times when corrected")
+    assert line.endswith(
+        "better when corrected: errors are 3.2 times the largest errors of a sound robot as logged, 0.8 times corrected"
+    )
+
+
+def test_observations_of_exchanged_joints_are_not_those_of_the_simulation():
+    parts = tuple(Correction(name, "order", "", order=(1, 0, 2)) for name in ("q", "v", "actions"))
+    joints = Correction("joints", "order", "a and b are swapped", order=(1, 0, 2), parts=parts)
+    found = dataclasses.replace(make_finding(0.9, 900.0, 3), text=joints.describe(), correction=joints)
+    usual = Answers(0.0, 0.0, {"q": (1.0, 1.0)}, (1.0, 1.0), simulated_error=(0.905, 0.237))
+    result = make_diagnosis(usual, build_mapping([], [], {}), [found])
+    asked = "2. are the observations those of the simulation?"
+    assert describe_answers(result)[1] == f"{asked} no, though each alone looks usual: q, v"
+    of_actions = dataclasses.replace(found, correction=parts[2])
+    assert describe_answers(dataclasses.replace(result, findings=(of_actions,)))[1] == f"{asked} yes"
+
+
+@pytest.mark.parametrize(
+    ("findings", "unexplained", "verdict"),
+    [
+        ([], "", "no mistake in the mapping found"),
+        ([], "the robot falls", "something differs, the cause is unknown: the robot falls"),
+        ([make_finding(0.0, 1e4, 1)], "", "something differs, the cause is unknown: q: wrong"),
+        (
+            [make_finding(0.96, 900.0), make_finding(0.85, 900.0)],
+            "",
+            "wrong is q: wrong (sure: it explains 96% of what differs, and nothing else that was tried does; "
+            "1 more below)",
+        ),
+        ([make_finding(0.5, 9.0)], "", "wrong is q: wrong (likely, but it explains only 50% of what differs)"),
+        (
+            [dataclasses.replace(make_finding(0.9, 9.0), also=("v: late",))],
+            "",
+            "wrong is q: wrong (one of 2 causes that this log cannot tell apart)",
+        ),
+    ],
+)
+def test_the_verdict_says_what_is_wrong_and_how_sure(findings, unexplained, verdict):
+    answers = Answers(0.0, 0.0, {}, (1.0, 1.0), unexplained)
+    assert describe_verdict(make_diagnosis(answers, build_mapping([], [], {}), findings)) == verdict
+
+
+def test_the_mapping_is_written_where_there_is_one(tmp_path, capsys):
+    answers, file = Answers(0.0, 0.0, {}, (1.0, 1.0)), tmp_path / "mapping.yaml"
+    write_mapping(make_diagnosis(answers, build_mapping([], [], {})), file)
+    assert not file.exists()
+    assert "not written: the mapping needs no correction" in capsys.readouterr().err
+    write_mapping(make_diagnosis(answers, build_mapping([], [SWAP], {"q": 3})), file)
+    assert file.read_text() == "observations:\n  q:\n    order: [1, 0, 2]\n"
 
 
 def test_of_two_mappings_a_comment_says_which_one_a_program_uses():
