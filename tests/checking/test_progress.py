@@ -2,6 +2,7 @@
 
 import pytest
 
+from rlctl.checking.rules.rl622_being_far_from_the_goal_pays import _explain_few
 from tests.checking.judging import case, check_case, findings, mark_slow
 
 pytest.importorskip("mujoco")
@@ -44,3 +45,9 @@ def test_finds_the_mistake_and_only_that(case):
 def test_finding_says_what_pays(name, words):
     (finding,) = findings(f"broken_progress.py:{name}", "RL622")
     assert [word for word in words if word not in finding.message] == []
+
+
+def test_too_few_successes_are_explained():
+    assert _explain_few(1) == (
+        "with the goal put where the robot is, 1 of 10 episodes had a success; the comparison needs 3"
+    )

@@ -72,7 +72,7 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         return
     insides = _find_insides(trials, source)
     if len(insides) < EPISODES:
-        yield Skipped(RULE.id, "no goal next to the robot was a success in several episodes")
+        yield Skipped(RULE.id, _explain_few(len(insides)))
         return
     moved = np.ptp(np.array([inside.place for inside in insides.values()]), axis=0) > FEWEST_MOVED * trials.range
     looks: list[tuple[_MeasureAxis, _Describe]] = [
@@ -85,6 +85,14 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         if axes:
             yield describe(trials, axes, shown)
             return
+
+
+def _explain_few(count: int) -> str:
+    """Return why `count` episodes with a success are too few."""
+    return (
+        f"with the goal put where the robot is, {count} of {MOST_EPISODES} episodes had a success; "
+        f"the comparison needs {EPISODES}"
+    )
 
 
 def _find_insides(trials: GoalTrials, source: Source) -> dict[int, _Outcome]:
