@@ -191,6 +191,13 @@ def test_a_million_steps(case, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_header_says_which_limit_only_a_server_uses():
+    policy = make_policy(make_arm())
+    limits = Limits.model_validate({"command": "action", "watchdog_periods": 30})
+    header = ControllerSource(policy, plan_of(policy), "arm", limits).write().header
+    assert " *   watchdog_periods: 30; only `rlctl serve` uses it\n" in header
+
+
 def test_default_ranges_of_orientations_and_commands(tmp_path):
     env = make_arm(
         observation_terms={"goal": terms.Gravity("orientation")},

@@ -51,4 +51,7 @@ def serve(
         out.print(f"{policy.file}: serving at ws://{address}, live page at http://{address}/")
         out.file.flush()
 
-    return run_server(make_server(policy.file, request), show)
+    server = make_server(policy.file, request)
+    run_server(server, show)
+    output.print_notes([server.summarize()])
+    return None

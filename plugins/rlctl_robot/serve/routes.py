@@ -15,6 +15,7 @@ from aiohttp import web
 
 from rlctl.errors import RlctlError, UsageError, did_you_mean
 from rlctl.play import remote_messages as messages
+from rlctl.runs.lookup import is_policy_file
 from rlctl_robot.serve.access import find_problem, is_websocket
 from rlctl_robot.serve.serve_request import LOOPBACK
 from rlctl_robot.serve.server import PolicyServer
@@ -189,24 +190,30 @@ class Routes:
         return web.json_response({"order": order, "clients": clients})
 
     async def _serve_override(self, request: web.Request) -> web.Response:
-        """Override the actions of all clients, `{"action": [...]}`; null ends the override."""
+        """Override the actions of all clients, `{"action": [...]}`; null ends the override.
+
+        Where the action is outside the bounds of the policy's actions, the answer has what is done: `limited_to`.
+        """
         try:
             content = messages.parse_json(await _read_body(request, 64 * 1024))
             if not isinstance(content, dict) or list(content) != ["action"]:
                 raise ValueError('send {"action": [numbers]}, or {"action": null} to end the override')
-            self.server.override(content["action"])
+            bounded = self.server.override(content["action"])
         except (ValueError, TypeError) as error:
             return _refuse(400, str(error))
-        return web.json_response({"overridden": content["action"] is not None})
+        answer: dict[str, Any] = {"overridden": content["action"] is not None}
+        if bounded is not None:
+            answer["limited_to"] = bounded
+        return web.json_response(answer)
 
     async def _serve_policy(self, request: web.Request) -> web.Response:
         content = await _read_body(request, _MAX_POLICY_SIZE)
         name = Path(request.query.get("name", "")).name
-        # The format of safetensors begins with the length of its header, in JSON.
-        suffix = ".safetensors" if content[8:9] == b"{" else ".onnx"
+        if not (_FILE_NAME.fullmatch(name) and is_policy_file(name)):
+            # The format of safetensors begins with the length of its header, in JSON.
+            name = "uploaded.safetensors" if content[8:9] == b"{" else "uploaded.onnx"
         with tempfile.TemporaryDirectory(prefix="rlctl-") as folder:
-            is_usable = _FILE_NAME.fullmatch(name) and name.endswith(suffix)
-            file = Path(folder) / (name if is_usable else f"uploaded{suffix}")
+            file = Path(folder) / name
             await asyncio.to_thread(file.write_bytes, content)
             try:
                 await self.server.replace_policy(file)

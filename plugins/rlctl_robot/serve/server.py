@@ -13,7 +13,9 @@ from typing import Any
 import aiohttp
 import numpy as np
 from aiohttp import web
+from gymnasium import spaces
 
+from rlctl import output
 from rlctl.errors import RlctlError, short_repr
 from rlctl.limits.bounds import SafetyEvent
 from rlctl.limits.limits import Limits
@@ -44,6 +46,7 @@ class PolicyServer:
         self._manual: Any | None = None  # the action of an override; None: the policy acts
         self._order: str | None = None  # the operator's last order, which later clients get too; None: no order
         self._limits = limits
+        self._began_s = time.monotonic()
         shapes = ObservationReader(policy.info.env).shapes
         self.largest_message = 64 * sum(map(math.prod, shapes.values())) + 64 * 1024  # text with names
         """Largest size of a request [bytes]."""
@@ -197,12 +200,29 @@ class PolicyServer:
         self._log.write("order", name=order)
         return len(self._sessions)
 
-    def override(self, action: Any | None) -> None:
-        """Override all present and later clients; None ends it. Raises `ValueError` for an invalid action."""
+    def override(self, action: Any | None) -> list[float] | None:
+        """Override all present and later clients; None ends it. Raises `ValueError` for an invalid action.
+
+        Return the action within the bounds of the policy's actions if it is outside them, or else None.
+        """
         for session in self._sessions.values():
             session.safety.override(action)
         self._manual = action
         self._log.write("order", name="policy" if action is None else "override")
+        space = self.policy.info.env.spaces()[1]
+        if action is None or not isinstance(space, spaces.Box):
+            return None
+        given = np.asarray(action, np.float64).ravel()
+        bounded = np.clip(given, space.low.ravel(), space.high.ravel())
+        return None if (bounded == given).all() else bounded.tolist()
+
+    def summarize(self) -> str:
+        """Return what it has done so far, as one line."""
+        answers = output.format_count(self.measurements.request.count, "answer")
+        clients = output.format_count(self.measurements.connections, "connection")
+        interventions = output.format_count(self.count_interventions().total(), "intervention")
+        duration = output.format_duration(time.monotonic() - self._began_s)
+        return f"served {answers} in {duration}: {clients}, {interventions} of limits and faults"
 
     async def replace_policy(self, file: Path) -> None:
         """Replace the policy from the next steps on; if it does not fit, raise `RlctlError` and keep the old one."""

@@ -184,7 +184,8 @@ class LimitsSource:
         named = self.limits.model_dump(exclude_defaults=True, mode="json")
         if not named:
             return "the bounds of the action only; export with --limits limits.yaml to limit positions, speeds and more"
-        lines = [f"  {key}: {_shorten(value)}" for key, value in named.items()]
+        of_server = {"watchdog_periods": "; only `rlctl serve` uses it"}
+        lines = [f"  {key}: {_shorten(value)}{of_server.get(key, '')}" for key, value in named.items()]
         return "\n" + "\n".join(lines)
 
     @property

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -48,6 +49,8 @@ def test_signals(served):
     assert read_metadata(address)["policy"] == "policy.safetensors"
     process.send_signal(signal.SIGTERM)
     assert process.wait(120) == 0
+    last = process.stderr.read().splitlines()[-1]
+    assert re.fullmatch(r"served 0 answers in \d+ s: 0 connections, 0 interventions of limits and faults", last)
     assert "policy refused" in (file.parent / "log.jsonl").read_text()
 
 

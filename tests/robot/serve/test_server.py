@@ -231,10 +231,13 @@ def test_actions_by_hand(serve):
     assert json.loads(server.post("/home")[1])["error"].startswith("the limits define no home")
     with server.client() as client:
         client.ask(OBSERVATION)
-        assert server.post("/override", {"action": [1, -1]})[0] == 200
+        status, text = server.post("/override", {"action": [1, -1]})
+        assert (status, json.loads(text)) == (200, {"overridden": True})
         assert client.ask({**OBSERVATION, "reset": True})["actions"].tolist() == [[1.0, -1.0]]
         with server.client() as later:
             assert later.ask(OBSERVATION)["actions"].tolist() == [[1.0, -1.0]]
+        bounded = json.loads(server.post("/override", {"action": [1000, -1]})[1])
+        assert bounded == {"overridden": True, "limited_to": [client.ask(OBSERVATION)["actions"][0, 0], -1.0]}
         for wrong in ({"action": [1]}, {"act": 1}, {"action": "up"}, [1, 2], {"action": [1e400, 0]}):
             assert server.post("/override", wrong)[0] == 400
         assert server.post("/override", {"action": None})[0] == 200
@@ -270,6 +273,10 @@ def test_another_policy_without_a_gap(serve, tmp_path):
         end.set()
         thread.join()
     assert [code for code, _ in refused] == [422] * 5
+    for name in ("x.safetensors", "x.onnx"):
+        status_of_junk, answer = server.post(f"/policy?name={name}", b"junk")
+        assert status_of_junk == 422
+        assert json.loads(answer)["error"].startswith(f"{name}: ")
     assert (
         "its observations are in the order goal, positions, the served policy's in"
         in json.loads(refused[2][1])["error"]
