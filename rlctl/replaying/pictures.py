@@ -239,7 +239,7 @@ class _Film:
 
     def report(self, path: Path) -> FilmReport:
         height, width = self._last.shape[:2]
-        return FilmReport(path, self._count, width, height, self._rate, self._count / self._seconds)
+        return FilmReport(path, self.writer.count, width, height, self._rate, self._count / self._seconds)
 
 
 class _Mp4:
@@ -253,11 +253,13 @@ class _Mp4:
         self._stream = self._container.add_stream("libx264", rate=fractions.Fraction(rate).limit_denominator(1000))
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = {"crf": "20"}
+        self.count = 0  # pictures in the file
 
     def add(self, picture: Picture) -> None:
         if self._stream.width != picture.shape[1]:
             self._stream.height, self._stream.width = picture.shape[:2]
         self._container.mux(self._stream.encode(self._av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        self.count += 1
 
     def close(self) -> None:
         self._container.mux(self._stream.encode())
@@ -271,6 +273,7 @@ class _Gif:
         self._path = path
         self._duration = round(1000 / rate)  # [ms]
         self._pictures: list[Any] = []
+        self.count = 0  # pictures in the file, when it is written
 
     def add(self, picture: Picture) -> None:
         from PIL import Image
@@ -278,12 +281,18 @@ class _Gif:
         self._pictures.append(Image.fromarray(picture).quantize(256, dither=Image.Dither.NONE))
 
     def close(self) -> None:
+        from PIL import Image
+
         first, *rest = self._pictures
         first.save(self._path, "GIF", save_all=True, append_images=rest, duration=self._duration, loop=0)
+        with Image.open(self._path) as written:  # equal pictures in a row are one that lasts longer
+            self.count = getattr(written, "n_frames", 1)
 
 
 class _Png:
     """One picture, written by Pillow."""
+
+    count = 1
 
     def __init__(self, path: Path, rate: float) -> None:
         self._path = path

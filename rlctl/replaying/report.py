@@ -33,7 +33,7 @@ class FilmReport:
     """A film that was written."""
 
     file: Path
-    pictures: int
+    pictures: int  # in the file, with those that show the end of each episode for a moment
     width: int
     height: int
     rate: float  # pictures per second, as it plays
