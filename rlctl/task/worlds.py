@@ -40,6 +40,8 @@ from rlctl.task.task import Task, check_definition, check_parameters
 
 RenderMode = Literal["human", "rgb_array"] | None
 
+_MARKER_RADIUS, _MARKER_COLOR = 0.01, (0.1, 0.8, 0.3, 0.8)  # [m]; hides neither a peg nor a block; films add a ring
+
 
 class WorldsStep(NamedTuple):
     """What a control step of k worlds gave."""
@@ -183,7 +185,9 @@ class TaskWorlds:
 
     def _add_markers(self, names: Sequence[str]) -> None:
         one = self.sim_of(0)
-        self._markers = {name: one.add_marker((0, 0, -10), radius=0.03, color=(0.1, 0.8, 0.3, 0.8)) for name in names}
+        self._markers = {
+            name: one.add_marker((0, 0, -10), radius=_MARKER_RADIUS, color=_MARKER_COLOR) for name in names
+        }
         self.sim.save()
 
     def sim_of(self, world: int) -> Sim:

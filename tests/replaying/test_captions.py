@@ -80,10 +80,13 @@ def test_a_world_without_a_ground_gets_a_floor_and_a_sky():
 
 
 @pytest.mark.slow
-def test_mujoco_draws_a_floor_too():
+def test_mujoco_draws_a_floor_of_squares_too():
     with contextlib.closing(make_filmable(EnvSpec("reach", sim=MUJOCO))) as env:
         env.reset(seed=0)
         sim = env.unwrapped.sim
         look = {"eye": (1.0, 1.0, 0.8), "target": (0.0, 0.0, 0.2), "field_of_view": 45.0, "sun": True}
         below, without = (sim.render(64, 48, floor=floor, **look) for floor in (0.3, None))
+        away = {**look, "eye": (4.0, 4.0, 0.8), "target": (7.0, 7.0, 0.2)}  # only the floor is seen
+        squares = sim.render(64, 48, floor=0.3, **away)[36].astype(int).mean(axis=1)
     assert (below != without).any(axis=2).mean() > 0.3
+    assert np.ptp(squares) > 15

@@ -16,6 +16,7 @@ _LARGE = 600  # [pixels]; higher pictures are drawn finer, which takes a third l
 _QUALITY = {"shadowsize": 2048}
 _FINE = {"shadowsize": 4096, "numslices": 40, "numstacks": 24}  # corners of MuJoCo's round shapes would be seen
 _FLOOR_SIDE, _FLOOR_DEPTH = 40.0, 0.02  # [m], where a world has no ground
+_MISSING_FLOOR = "floor of pictures"  # its material
 _OF_CAMERA = 0.5  # how much of the light from the camera is left
 
 
@@ -70,7 +71,7 @@ def draw(
         if sun:
             _add_sun(renderer.scene, target)
         if floor is not None:
-            _add_floor(renderer.scene, floor, target)
+            _add_floor(renderer.scene, model, floor, target)
         for marker in markers:
             _add_marker(renderer.scene, marker)
         picture: NDArray[np.uint8] = renderer.render()
@@ -85,19 +86,20 @@ def light_scene(spec: Any) -> None:
     spec.add_texture(
         name="sky", type=sky, builtin=gradient, rgb1=[0.75, 0.83, 0.92], rgb2=[0.95] * 3, width=64, height=384
     )
+    add_checker(spec, _MISSING_FLOOR)
 
 
-def add_checker(spec: Any) -> str:
+def add_checker(spec: Any, name: str = "checker") -> str:
     """Add a pattern of squares of 0.5 m to a model, on which motion is seen; return the name of the material."""
     mujoco = import_mujoco()
     flat, checker = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     colors = {"rgb1": [0.86, 0.88, 0.9], "rgb2": [0.74, 0.77, 0.8]}
-    spec.add_texture(name="checker", type=flat, builtin=checker, width=64, height=64, **colors)
-    material = spec.add_material(name="checker", texuniform=True, texrepeat=[1.0, 1.0])
+    spec.add_texture(name=name, type=flat, builtin=checker, width=64, height=64, **colors)
+    material = spec.add_material(name=name, texuniform=True, texrepeat=[1.0, 1.0])
     textures = list(material.textures)
-    textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "checker"
+    textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = name
     material.textures = textures
-    return "checker"
+    return name
 
 
 _kept: list[Any] = []
@@ -130,13 +132,17 @@ def _add_sun(scene: Any, target: Any) -> None:
     scene.nlight += 1
 
 
-def _add_floor(scene: Any, height: float, target: Any) -> None:
-    """Add a wide, thin box: OpenGL's lists have no plane that is not in the model."""
+def _add_floor(scene: Any, model: Any, height: float, target: Any) -> None:
+    """Add a wide, thin box of squares: OpenGL's lists have no plane that is not in the model.
+
+    Its middle is on a multiple of the squares, which then stand still while the camera follows a robot.
+    """
     mujoco = import_mujoco()
     size, turn = [_FLOOR_SIDE / 2, _FLOOR_SIDE / 2, _FLOOR_DEPTH / 2], np.eye(3).ravel()
-    middle = np.array([target[0], target[1], height - _FLOOR_DEPTH / 2])
-    geom, color = scene.geoms[scene.ngeom], np.array([0.8, 0.83, 0.86, 1.0], np.float32)
+    middle = np.array([*np.round(target[:2]), height - _FLOOR_DEPTH / 2])
+    geom, color = scene.geoms[scene.ngeom], np.ones(4, np.float32)
     mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, size, middle, turn, color)
+    geom.matid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, _MISSING_FLOOR)
     scene.ngeom += 1
 
 
