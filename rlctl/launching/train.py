@@ -62,7 +62,7 @@ def run_training(request: TrainRequest, find: Callable[[TrainRequest], Start] = 
             verb = "resume"
         title = f"{verb} {start.task} ({how})"
         display = make_display(title, start.recipe.total_timesteps)
-        observers = [WarnOfFindings(), SendToTracker()]
+        observers = [WarnOfFindings(start.request), SendToTracker()]
         with display, collect() as printed, set_up(start, display, printed, observers) as training:
             signals.begin(training)
             training.run()

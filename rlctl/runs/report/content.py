@@ -16,7 +16,7 @@ from rlctl.output import format_duration
 from rlctl.play.episode import RecordedEpisode
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference
 from rlctl.recipe.stages import format_value
-from rlctl.runs.diagnosis.findings import Finding
+from rlctl.runs.diagnosis.findings import Finding, list_followers
 from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.report.show import RunDescription
@@ -236,14 +236,25 @@ def describe_absence(report: RunReport) -> str:
 
 
 def collect_findings(report: RunReport) -> list[tuple[Finding, list[str]]]:
-    """Return the findings of all runs, each once, with the evidence of every run."""
+    """Return the findings of all runs, each once, with the evidence of every run; without those that only follow."""
     findings: dict[str, tuple[Finding, list[str]]] = {}
     for run in report.runs:
         for finding in run.findings:
+            if finding.follows:
+                continue
             seed = f"seed {run.summary.seed}: " if len(report.runs) > 1 else ""
             _, evidence = findings.setdefault(f"{finding.id} {finding.name}", (finding, []))
             evidence.append(seed + "; ".join(finding.evidence))
     return list(findings.values())
+
+
+def collect_followers(report: RunReport) -> list[str]:
+    """Return a line for each finding of a run that others probably follow from."""
+    lines = []
+    for run in report.runs:
+        seed = f"seed {run.summary.seed}: " if len(report.runs) > 1 else ""
+        lines += [seed + line for line in list_followers(run.findings)]
+    return lines
 
 
 def list_commands(report: RunReport) -> list[str]:

@@ -12,7 +12,7 @@ from rlctl.errors import ArtifactError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.robustness import Robustness
 from rlctl.recipe.stages import format_value
-from rlctl.runs.diagnosis.findings import diagnose, format_finding
+from rlctl.runs.diagnosis.findings import diagnose, format_findings
 from rlctl.runs.diagnosis.history import RunHistory
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import as_json
@@ -120,8 +120,8 @@ def show(run: RunDescription, json: str | None) -> None:
         out.print(line)
     if run.audit is None and summary.best_success is not None and summary.best_success < _POOR_SUCCESS:
         out.print(f"what has it learned instead? rlctl runs show {shlex.quote(str(summary.path))} --audit")
-    for finding in run.findings:
-        out.print("\n".join(format_finding(finding)))
+    for line in format_findings(run.findings):
+        out.print(line)
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())
     out.print(f"files: {files}  in {summary.path}")
 
