@@ -19,7 +19,7 @@ from rlctl.recipe.stages import format_value
 from rlctl.runs.diagnosis.findings import Finding, list_followers
 from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
-from rlctl.runs.report.show import RunDescription
+from rlctl.runs.report.show import RunDescription, list_changes
 from rlctl.runs.tables import Rows, list_points
 
 _SETTINGS_NAMED = 3  # in the name of a recipe
@@ -171,7 +171,7 @@ def _name_recipe(settings: Mapping[str, Any]) -> str:
 
 
 def list_facts(report: RunReport) -> list[tuple[str, str]]:
-    """Return names and texts: task, start, duration, machine and versions."""
+    """Return names and texts: task, differences from its recipe, start, duration, machine and versions."""
     summaries = [run.summary for run in report.runs]
     task = summaries[0].task
     entry = installed.find(task)
@@ -186,12 +186,23 @@ def list_facts(report: RunReport) -> list[tuple[str, str]]:
         trained = f"{len(summaries)} trainings, {of_steps} steps each, {seconds} together"
     facts = {
         "Task": f"{task}: {summary}" if summary else task,
+        "Differs from the task's recipe": "; ".join(_list_changes(report)),
         "Started": " to ".join(dict.fromkeys((started[0], started[-1]))) + " UTC" if started else "",
         "Trained": trained,
         "Machine": "; ".join(host.strip(", ") for host in hosts),
         "Versions": ", ".join(f"{name} {version}" for name, version in summaries[0].versions.items()),
     }
     return [(name, text) for name, text in facts.items() if text]
+
+
+def _list_changes(report: RunReport) -> list[str]:
+    """Return what differs from the task's recipe, of several recipes each with its name."""
+    texts = []
+    for recipe in report.recipes:
+        changes = ", ".join(list_changes(recipe.runs[0].summary))
+        if changes:
+            texts.append(f"{recipe.name}: {changes}" if len(report.recipes) > 1 else changes)
+    return texts
 
 
 def summarize_result(runs: Sequence[RunDescription]) -> str:
@@ -229,9 +240,11 @@ def describe_absence(report: RunReport) -> str:
     rates = [run.summary.best_success for run in report.runs if run.summary.best_success is not None]
     if not rates or (best := max(rates)) >= _GOOD_SUCCESS:
         return f"Nothing unusual in the records of {which}."
+    run = next(run for run in report.runs if run.summary.best_success == best)
     return (
-        f"The records of {which} show no known mistake, but the best policy succeeds in only {best:.1%} of the "
-        "episodes: train longer, make the task easier first (stages), or look at an episode with rlctl replay."
+        f"No sign of a known mistake was found in the records of {which}, but the best policy succeeds in only "
+        f"{best:.1%} of the episodes. What has it learned instead? rlctl runs show "
+        f"{shlex.quote(str(run.summary.path))} --audit"
     )
 
 
