@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 
 from rlctl.environments import installed
-from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
+from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.output import format_duration
 from rlctl.play.episode import RecordedEpisode
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference
-from rlctl.recipe.stages import format_value
 from rlctl.runs.diagnosis.findings import Finding, list_followers
 from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
+from rlctl.runs.recipe_names import name_recipes
 from rlctl.runs.report.show import RunDescription, list_changes
 from rlctl.runs.tables import Rows, list_points
 
-_SETTINGS_NAMED = 3  # in the name of a recipe
 _GOOD_SUCCESS = 0.5
 _TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")  # what rlctl names runs and groups by
 _COMPLETE = 0.95  # of the steps of the longest seed: rollouts end at slightly different steps
@@ -118,9 +117,7 @@ def _group_by_recipe(runs: Sequence[RunDescription], arguments: Mapping[Path, st
             groups.append((recipe, [run]))
         else:
             same.append(run)
-    changes = [find_difference(recipe, groups[0][0]) for recipe, _ in groups]
-    baseline = {key: before for change in changes for key, (_, before) in change.items()}
-    names = [_name_recipe(baseline | {key: value for key, (value, _) in change.items()}) for change in changes]
+    names = name_recipes([recipe for recipe, _ in groups])
     labels = names
     candidates = [
         [_find_argument(group, arguments) for _, group in groups],
@@ -159,15 +156,6 @@ def _find_folder(runs: Sequence[RunDescription]) -> str:
 def _find_algorithm(runs: Sequence[RunDescription]) -> str:
     algorithms = {run.summary.algo for run in runs}
     return algorithms.pop() if len(algorithms) == 1 else ""
-
-
-def _name_recipe(settings: Mapping[str, Any]) -> str:
-    """Return `learning_rate 0.001, gamma 0.98`; of many settings the first."""
-    names = [
-        f"{key.rpartition('.')[2]} {short_repr(re.sub(r'[^ ]*/', '', format_value(key, value)), 30)}"
-        for key, value in settings.items()
-    ]
-    return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
 
 
 def list_facts(report: RunReport) -> list[tuple[str, str]]:
