@@ -143,7 +143,10 @@ def compare_runs(
     force: Annotated[
         bool, Option("Compare although the task has changed or a seed is unfinished.", ("--force",))
     ] = False,
-    gate: Annotated[Literal["not-worse"] | None, Option("Exit 1 if any is worse than the first.")] = None,
+    gate: Annotated[
+        Literal["not-worse", "better"] | None,
+        Option("Exit 1 if any is worse than the first, or unless all are shown to be better."),
+    ] = None,
     margin: Annotated[
         float | None, Option("Exit 1 unless the episodes exclude a larger loss of success, e.g. 0.05.", min=0)
     ] = None,
@@ -165,7 +168,7 @@ def compare_runs(
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
     from rlctl.evaluation.eval_request import EvalRequest
     from rlctl.runs.compare.comparison import compare
-    from rlctl.runs.compare.report import make_suite, show
+    from rlctl.runs.compare.report import BETTER, make_suite, show
     from rlctl.storage.junit import write as write_junit
 
     began = time.monotonic()
@@ -178,15 +181,25 @@ def compare_runs(
         return
     if picture is not None:
         raise UsageError("--picture draws maps: add --vary, or draw learning curves: rlctl runs report --format png")
+    is_better = gate == BETTER
+    if is_better and margin is not None:
+        raise UsageError("--gate better and --margin exclude each other: a margin is of --gate not-worse")
     result = compare(runs, request, threshold, force=force, margin=margin)
     show(result, json, gate, margin, allow_no_success=allow_no_success)
     has_gate = gate is not None or margin is not None
     if junit is not None:
         seconds = time.monotonic() - began
-        suite = make_suite(result, seconds, has_gate=has_gate, margin=margin, allow_no_success=allow_no_success)
+        suite = make_suite(
+            result,
+            seconds,
+            has_gate=has_gate,
+            margin=margin,
+            allow_no_success=allow_no_success,
+            better=is_better,
+        )
         write_junit(junit, [suite])
     if has_gate:
-        result.check(margin, allow_no_success=allow_no_success)
+        result.check(margin, allow_no_success=allow_no_success, better=is_better)
 
 
 def _compare_maps(

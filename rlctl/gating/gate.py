@@ -93,17 +93,28 @@ class GateReport:
         return next(iter(errors or codes), 0)
 
     def make_suites(self) -> list[Suite]:
-        """Return the test cases: the rules of the check, the gates, and a case for each step."""
+        """Return the test cases: the rules of the check, the gates, and a case for each step.
+
+        A step whose failure is a case of its own suite has no case here: it would be counted twice.
+        """
         classname = f"{self.task}.gate"
-        suites = []
+        suites = {}
         if self.checked is not None:
-            suites.append(check_junit.make_suite(self.checked))
+            suites["check"] = check_junit.make_suite(self.checked)
         if self.evaluation is not None:
             seconds = next(step.seconds for step in self.steps if step.name == "eval")
-            suites.append(evaluation_junit.make_suite(self.evaluation, self.gates, seconds))
-        cases = [_make_case(classname, step) for step in self.steps]
-        suites.append(Suite(f"rlctl gate {self.task}", sum(step.seconds for step in self.steps), cases))
-        return suites
+            suites["eval"] = evaluation_junit.make_suite(self.evaluation, self.gates, seconds)
+        reported = [step.name for step in self.steps if step.result is Result.FAILED and _fails(suites.get(step.name))]
+        cases = [_make_case(classname, step) for step in self.steps if step.name not in reported]
+        seconds = sum(step.seconds for step in self.steps if step.name not in reported)
+        return [*suites.values(), Suite(f"rlctl gate {self.task}", seconds, cases)]
+
+
+def _fails(suite: Suite | None) -> bool:
+    """Whether a test case of the suite has not passed."""
+    return suite is not None and any(
+        entry.tag in ("failure", "error") for case in suite.cases for entry in case.outcomes
+    )
 
 
 def _make_case(classname: str, step: GateStep) -> Case:

@@ -62,7 +62,7 @@ def run_training(request: TrainRequest, find: Callable[[TrainRequest], Start] = 
             verb = "resume"
         title = f"{verb} {start.task} ({how})"
         display = make_display(title, start.recipe.total_timesteps)
-        observers = [WarnOfFindings(), SendToTracker()]
+        observers = [WarnOfFindings(start.request), SendToTracker()]
         with display, collect() as printed, set_up(start, display, printed, observers) as training:
             signals.begin(training)
             training.run()
@@ -130,12 +130,12 @@ def show(result: TrainResult, json: str | None) -> None:
 
 
 def list_next_commands(result: TrainResult) -> list[str]:
-    """Return the next commands: export, or for a policy that never succeeded the diagnosis of its run."""
+    """Return the next commands: export, or for a policy that never succeeded what it has learned instead."""
     run = shlex.quote(str(result.run.path))
     score = result.best.evaluation if result.best else None
     fails = score is not None and score.success == 0
     tensorboard = f"tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}"
-    second = f"rlctl runs show {run}" if fails else f"rlctl export {run} --onnx"
+    second = f"rlctl runs show {run} --audit" if fails else f"rlctl export {run} --onnx"
     return [f"rlctl eval {run}", second, f"rlctl replay {run}", tensorboard]
 
 

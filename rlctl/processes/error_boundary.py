@@ -102,7 +102,8 @@ def report_unexpected(error: Exception) -> int:
     if (format_message := getattr(error, "format_message", None)) is not None:  # Typer's own usage errors
         command = getattr(getattr(error, "ctx", None), "command_path", "rlctl")
         is_help = type(error).__name__ == "NoArgsIsHelpError"
-        text = f"error: {short_repr(format_message(), _LONGEST_LINE)}\n{command} --help lists what it takes"
+        message = format_message().replace(": Value error, ", ": ", 1)  # Typer adds the type of a converter's exception
+        text = f"error: {short_repr(message, _LONGEST_LINE)}\n{command} --help lists what it takes"
         print(format_message() if is_help else text, file=sys.stderr)
         return 2
     if _is_out_of_memory(error):

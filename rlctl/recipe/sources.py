@@ -87,6 +87,13 @@ def _list_keys_of_algorithm(chosen: Any) -> tuple[str, ...]:
     return (*_OF_THE_ALGORITHM, "privileged")
 
 
+def find_given_parameters(task: str, config: Path | None, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the algorithm's parameters that `--config` and the command line give, not the packaged recipe."""
+    sources = _list_sources(task, config, settings)
+    from_line, from_config, _ = (_select_values(source, sources) for source in sources)
+    return merge(from_config.get("algo_kwargs") or {}, from_line.get("algo_kwargs") or {})
+
+
 def describe_other_algorithm(task: str, config: Path | None, settings: Mapping[str, Any]) -> list[str]:
     """Return a line for each recipe that is for another algorithm than the chosen one: what does not carry over."""
     sources = _list_sources(task, config, settings)

@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 
 from rlctl.errors import ArtifactError, RlctlError
-from rlctl.runs.diagnosis.findings import diagnose, format_finding
+from rlctl.runs.diagnosis.findings import diagnose, format_findings
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.lookup import find_run
 from rlctl.runs.tables import read_table
@@ -47,7 +47,7 @@ def write_bug_report(name: str | None) -> str:
 def _describe_run(run: RunDirectory) -> str:
     try:
         status, recipe = run.status(), run.recipe_file.read_text()
-        findings = [line for finding in diagnose(run) for line in format_finding(finding)]
+        findings = format_findings(diagnose(run))
     except (RlctlError, OSError) as error:
         return f"the run cannot be read: {error}"
     command = " ".join(map(str, status.get("command", [])))

@@ -95,23 +95,23 @@ def test_no_arguments_show_the_help(rlctl):
         (
             ["runs", "--sort", "stepz"],
             2,
-            "Invalid value for '--sort': Value error, 'stepz' is not one of 'newest', 'score', 'steps', 'minutes'",
+            "Invalid value for '--sort': 'stepz' is not one of 'newest', 'score', 'steps', 'minutes'",
         ),
         (
             ["runs", "report", "latest", "--format", "txt"],
             2,
-            "Invalid value for '--format': Value error, 'txt' is not one of 'html', 'md', 'table', 'csv', "
+            "Invalid value for '--format': 'txt' is not one of 'html', 'md', 'table', 'csv', "
             "'latex', 'svg', 'pdf', 'png'",
         ),
         (
-            ["runs", "compare", "a", "b", "--gate", "better"],
+            ["runs", "compare", "a", "b", "--gate", "worse"],
             2,
-            "Invalid value for '--gate': Value error, 'better' is not one of 'not-worse'",
+            "Invalid value for '--gate': 'worse' is not one of 'not-worse', 'better'",
         ),
         (
             ["check-env", "reach", "--format", "xml"],
             2,
-            "Invalid value for '--format': Value error, 'xml' is not one of 'text', 'json', 'sarif', 'junit', 'github'",
+            "Invalid value for '--format': 'xml' is not one of 'text', 'json', 'sarif', 'junit', 'github'",
         ),
         (["train", "reech"], 2, "error: no task 'reech'. Did you mean 'reach'? Installed: "),
         (["train", ""], 2, "error: no task ''. Installed: "),

@@ -1,5 +1,6 @@
 """The gate: every step is taken, one report says what is wrong, and one exit code."""
 
+import dataclasses
 import json
 from pathlib import Path
 from xml.etree import ElementTree
@@ -8,6 +9,7 @@ import pytest
 
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
+from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.gating.gate import GateReport, GateRequest, GateStep, Result
 from rlctl.gating.report import as_json, to_markdown
 from rlctl.storage import junit
@@ -41,6 +43,18 @@ def test_junit_has_a_case_for_each_step():
     (failed,) = suite.findall("testcase/failure")
     assert failed.get("message") == "success rate 0.500 is below 0.9"
     assert [case.get("classname") for case in suite] == ["reach.gate"] * 4
+
+
+def test_junit_counts_a_missed_gate_once(block_run):  # noqa: F811
+    report = make_report(PASSED, MISSED, LEFT_OUT)
+    evaluation = run_evaluation(EvalRequest(str(block_run.path), episodes=2))
+    report = dataclasses.replace(report, evaluation=evaluation, gates=Gates(min_return=1e9))
+    own, steps = ElementTree.fromstring(junit.to_xml(report.make_suites()))
+    assert (own.get("failures"), steps.get("failures")) == ("1", "0")
+    assert [case.get("name") for case in steps] == ["check", "export"]
+    passed = dataclasses.replace(report, steps=[PASSED, dataclasses.replace(PASSED, name="eval")], gates=NO_GATES)
+    own, steps = ElementTree.fromstring(junit.to_xml(passed.make_suites()))
+    assert [case.get("name") for case in steps] == ["check", "eval"]
 
 
 def test_markdown_has_a_row_for_each_step():
@@ -100,6 +114,8 @@ def test_all_steps_of_a_policy(rlctl, block_run, tmp_path):  # noqa: F811
     assert not (tmp_path / "policy.onnx").exists()
     assert json.loads((tmp_path / "gate.sarif").read_text())["runs"][0]["results"]
     assert (tmp_path / "gate.md").read_text().startswith("**rlctl gate not passed")
+    *_, steps = ElementTree.fromstring((tmp_path / "gate.xml").read_text())
+    assert [case.get("name") for case in steps] == ["eval", "compare", "export"]  # the rules are cases of their own
     done = rlctl("gate", block_run.path, "--no-check", *options[:4], "--set", "randomize=false", "--json", "gate.json")
     results = [step["result"] for step in json.loads((tmp_path / "gate.json").read_text())["steps"]]
     assert (results, done.returncode) == (["skipped", "passed", "passed", "skipped"], 0)

@@ -15,4 +15,4 @@ def test_a_policy_that_never_succeeded_is_not_to_be_exported_next(train):
         best = result.best.model_copy(update={"evaluation": Score(success=success, mean_return=1.0)})
         commands = list_next_commands(dataclasses.replace(result, best=best))
         assert any(command.startswith("rlctl export") for command in commands) == is_shown
-        assert any(command.startswith("rlctl runs show") for command in commands) != is_shown
+        assert any(command.endswith("--audit") for command in commands) != is_shown

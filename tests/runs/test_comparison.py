@@ -17,8 +17,8 @@ from rlctl.recipe.recipe import find_difference
 from rlctl.recipe.sources import resolve
 from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare
 from rlctl.runs.compare.margin import check_margin
-from rlctl.runs.compare.report import as_json, describe_candidate, format_needed, make_suite
-from rlctl.runs.compare.significance import Verdict
+from rlctl.runs.compare.report import as_json, describe_candidate, describe_seeds, format_needed, make_suite
+from rlctl.runs.compare.significance import MeanDifference, Verdict
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.report.write import write_report
@@ -78,6 +78,10 @@ def test_recipes_are_compared_seed_by_seed(root):
     assert result.of_recipes
     (candidate,) = result.candidates
     assert candidate.recipe_changes == {"algo_kwargs.gamma": (0.99, 0.9)}
+    assert (result.baseline.label, candidate.side.label) == ("gamma 0.9", "gamma 0.99")
+    scores = result.baseline.scores("return")
+    low, high = f"{scores.min():.4g}", f"{scores.max():.4g}"
+    assert describe_seeds(result, result.baseline).endswith(f"(range of 2 seeds {low} to {high})")
     assert candidate.verdict is Verdict.CANNOT_TELL
     needed = format_needed(candidate, comparisons=1)
     assert "smallest possible p-value is 0.33" in needed
@@ -166,7 +170,7 @@ def test_a_margin_must_be_excluded(root):
     candidate = dataclasses.replace(result.candidates[0], differences={"success": tied})
     result = dataclasses.replace(result, candidates=[candidate])
     result.check(margin=0.2)
-    with pytest.raises(AnswerIsNo, match=r"its success may be lower by 0\.2, more than 0\.1$"):
+    with pytest.raises(AnswerIsNo, match=r"its success may be lower by as much as 0\.2; --margin allows 0\.1$"):
         result.check(margin=0.1)
 
 
@@ -203,6 +207,33 @@ def test_a_copy_of_a_policy_passes_any_margin(root, tmp_path):
     result.check(margin=0.05)
     assert describe_candidate(result, result.candidates[0])[0].startswith("the same policy file (sha256 ")
     assert result.candidates[0].side.runs[0].evaluation is result.baseline.runs[0].evaluation
+
+
+def test_a_worse_policy_that_misses_a_margin_is_called_lower():
+    worse = MeanDifference(mean=-0.8, low=-0.9, high=-0.7, p=0.001, needed=8)
+    candidate = Candidate(Side("b", [], []), {"success": worse}, {})
+    assert candidate.describe_loss(0.05) == "its success is lower by 0.8, perhaps by 0.9; --margin allows 0.05"
+
+
+@pytest.mark.parametrize(
+    ("success", "of_return", "is_better"),
+    [
+        ((0.2, 0.1, 0.3, 0.01), (1.0, -1.0, 3.0, 0.3), True),
+        ((0.0, -0.1, 0.1, 1.0), (2.0, 1.0, 3.0, 0.01), True),  # equal in success, higher in return
+        ((-0.2, -0.3, -0.1, 0.01), (2.0, 1.0, 3.0, 0.01), False),  # success decides
+        ((0.2, -0.1, 0.5, 0.2), (2.0, -1.0, 5.0, 0.2), False),
+        ((0.2, -0.1, 0.5, 0.04), (2.0, -1.0, 5.0, 0.2), False),  # of few seeds: the interval contains 0
+    ],
+)
+def test_the_gate_better(root, success, of_return, is_better):
+    quantities = {"success": success, "return": of_return}
+    differences = {name: MeanDifference(*values, needed=None) for name, values in quantities.items()}
+    one, two = sorted((root / "0.9/Line").iterdir())
+    result = compare([str(one), str(two)], EvalRequest(None, episodes=4))
+    changed = dataclasses.replace(result.candidates[0], differences=differences)
+    result = dataclasses.replace(result, candidates=[changed])
+    missed = [] if is_better else [f"{two}: not shown to be better than {one}"]
+    assert result.list_missed(better=True) == missed
 
 
 def test_gate(root):

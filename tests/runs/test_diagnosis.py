@@ -62,7 +62,7 @@ def write_training(tmp_path):
         _write_table(run.evals_file, {"steps": STEPS[every], **evaluated, **dict(evaluations)})
         run.recipe_file.write_text(
             yaml.safe_dump(
-                {"algo": "ppo", "algo_kwargs": {"learning_rate": 0.009}, "total_timesteps": 30_000, **dict(recipe)}
+                {"algo": "ppo", "algo_kwargs": {"learning_rate": 0.0009}, "total_timesteps": 30_000, **dict(recipe)}
             )
         )
         run.status_file.write_text(json.dumps({"status": "finished", "task": "reach", **status}))
@@ -357,7 +357,7 @@ def test_advice_has_the_recipes_value_beside_the_usual_ones(write_training):
     run = write_training({**FLAT, "approx_kl": 0.6, "clip_fraction": 0.7})
     (finding,) = (each for each in diagnose(run) if each.id == "Q3")
     settings = {each.name: each for each in finding.settings}
-    assert settings["learning_rate"].value == 0.009
+    assert settings["learning_rate"].value == 0.0009
     assert "1e-5 to 1e-3" in settings["learning_rate"].advice
     assert settings["clip_range"].value == 0.2  # SB3's default
 
@@ -394,9 +394,9 @@ def test_advice_names_no_parameter_that_the_algorithm_does_not_have(write_traini
 def test_every_sign_of_a_finding_exists():
     from rlctl.runs.diagnosis.findings import _texts
 
-    named = {name.removeprefix("not ") for each in _texts()["findings"] for when in each["when"] for name in when}
+    named = {name.removeprefix("not ") for each in _texts() for when in each["when"] for name in when}
     assert named <= set(list_signs())
-    assert {each["id"] for each in _texts()["findings"]} == {f"Q{number}" for number in range(1, 15)}
+    assert {each["id"] for each in _texts()} == {f"Q{number}" for number in range(1, 16)}
 
 
 # Of PPO with a learning rate of 0.03, whose rollouts are so long that 60,000 steps are four updates.
@@ -424,7 +424,8 @@ def test_a_collapse_is_found_after_four_updates(write_training, more):
 
 
 def test_a_return_that_falls_while_updates_are_small_is_not_called_a_collapse(write_training):
-    assert diagnose(write_training({"return": -RISING, "success": None})) == []
+    (finding,) = diagnose(write_training({"return": -RISING, "success": None}))
+    assert finding.name == "does not learn"
 
 
 FLAT_SUCCESS = [0.02, 0.09, 0.2, 0.11, 0.08, 0.12]
@@ -502,3 +503,57 @@ def test_a_finding_is_explained(rlctl):
     done = rlctl("check-env", "--explain", "Q99")
     assert done.returncode == 2
     assert "no finding 'Q99'" in done.stderr
+
+
+DIPS = -1400 - 350 * np.sin(np.linspace(0, np.pi, UPDATES))  # as Pendulum-v1 with a gamma of 0.2
+DIPS[0] = -1200
+
+
+def test_a_training_that_never_rises_above_its_start_is_found(write_training):
+    (finding,) = diagnose(write_training({"return": DIPS, "success": None}))
+    assert (finding.id, finding.name, finding.grade) == ("Q1", "does not learn", Grade.WARNING)
+    assert finding.evidence[-1] == "training return -1200 at first, -1438 at best later"
+
+
+@pytest.mark.parametrize("status", [{"from": {"policy": "a.safetensors"}}, {"demos": {"path": "demos"}}])
+def test_a_training_that_begins_trained_may_stay_as_it_is(write_training, status):
+    assert diagnose(write_training({"return": DIPS, "success": None}, **status)) == []
+
+
+def test_a_training_that_learns_at_once_and_is_flat_from_then_on_is_no_finding(write_training):
+    learned = np.full(UPDATES, -150.0) + np.tile([3.0, -3.0], UPDATES // 2)
+    learned[0] = -1200
+    assert diagnose(write_training({"return": learned, "success": None})) == []
+
+
+@pytest.mark.parametrize(
+    "metrics",
+    [
+        {"return": DIPS, "success": None},
+        {"return": np.where(np.arange(UPDATES) % 6 == 0, DIPS, np.nan), "success": None},  # of few episodes
+        {"success": 0.0},  # whatever the return does
+    ],
+)
+def test_a_training_that_learns_little_with_a_gamma_of_one_step_is_found(write_training, metrics):
+    (finding,) = diagnose(write_training(metrics, recipe={"algo_kwargs": {"gamma": 0.2}}))
+    assert (finding.id, finding.grade) == ("Q15", Grade.WARNING)
+    assert finding.evidence[0] == "gamma 0.2: usually 0.9 to 0.9999; the policy then sees about 1 step ahead"
+    assert [setting.name for setting in finding.settings] == ["gamma"]  # none that is in its usual range
+
+
+def test_a_training_that_learns_with_an_unusual_value_has_no_finding(write_training):
+    assert diagnose(write_training(recipe={"algo_kwargs": {"gamma": 0.2}})) == []
+
+
+def test_what_follows_from_a_stronger_finding_is_one_line(write_training, rlctl):
+    metrics = {**FLAT, "approx_kl": 9.0, "clip_fraction": 0.9, "explained_variance": 0.0, "action_saturation": 0.97}
+    run = write_training(metrics, recipe={"algo_kwargs": {"learning_rate": 0.1}})
+    lines = format_end(diagnose(run), "runs/x")
+    assert lines[0].startswith("warning: Q3 oscillates")
+    assert [line for line in lines if "warning:" in line] == lines[:1]
+    assert not any("Q15" in line for line in lines)  # Q3 names the learning rate already
+    followers = "may follow from Q3: Q9 observations do not suffice, Q12 explores too little or too much"
+    assert lines[-1] == followers
+    assert followers in rlctl("runs", "show", run.path).stdout.splitlines()
+    assert followers in rlctl("runs", "report", run.path, "--format", "md").stdout
+    assert "**Q9" not in rlctl("runs", "report", run.path, "--format", "md").stdout

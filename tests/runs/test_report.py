@@ -148,7 +148,15 @@ def test_a_bad_result_is_not_called_usual(write_run):
     run = write_run("reach/2026-11-21_10-00-00_s0", evals=((1000, 0.088, 1.0),))
     page = write(run)
     assert "Nothing unusual" not in page
-    assert "The records of this training show no known mistake, but the best policy succeeds in only 8.8%" in page
+    assert "the best policy succeeds in only 8.8% of the episodes. What has it learned instead? rlctl runs show" in page
+
+
+def test_a_report_shows_what_differs_from_the_tasks_recipe(write_run):
+    changes = {"recipe_changes": {"reward_weights.action": -50.0}, "recipe_before": {"reward_weights.action": -0.05}}
+    report = content.collect([str(write_run("reach/a", evals=((1000, 0.0, 1.0),), **changes))])
+    wanted = "reward_weights.action = -50.0 (recipe: -0.05)"
+    assert dict(content.list_facts(report))["Differs from the task's recipe"] == wanted
+    assert content.describe_absence(report).endswith("/runs/reach/a --audit")
 
 
 def test_curves_of_seeds_are_averaged_at_common_steps():

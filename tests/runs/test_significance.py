@@ -140,6 +140,7 @@ def test_figures_over_seeds_are_those_of_rliable():
     resampled = trim_mean(candidate[rng.integers(12, size=(20_000, 12))], 0.25, axis=1)
     assert interquartile_mean_interval(candidate) == pytest.approx(np.percentile(resampled, [2.5, 97.5]), abs=0.05)
     assert interquartile_mean_interval(np.full(5, 2.0)) == (2.0, 2.0)
+    assert interquartile_mean_interval(candidate[:4]) is None  # that of two seeds would be their range
 
 
 def test_probability_of_improvement_of_normal_scores():

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
-from rlctl.recipe.recipe import NOT_SET, find_difference, find_mixed
+from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.runs.compare.margin import check_margin
 from rlctl.runs.compare.policy_alone import PolicyAlone, find_same_policy, reports_success
 from rlctl.runs.compare.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.lookup import describe_source_change
+from rlctl.runs.recipe_names import name_recipes
 from rlctl.runs.summary import summarize
 from rlctl.runs.tables import read_table
 
@@ -54,6 +55,12 @@ class Side:
     name: str
     runs: list[EvaluatedRun]
     mixed: list[str]  # recipe keys in which its own runs differ; there should be none
+    difference: str = ""  # of a recipe what distinguishes it from the others, where that names it
+
+    @property
+    def label(self) -> str:
+        """The name in texts."""
+        return self.difference or self.name
 
     @property
     def has_success(self) -> bool:
@@ -86,6 +93,25 @@ class Candidate:
         verdicts = (difference.verdict for difference in self.differences.values())
         return next((verdict for verdict in verdicts if verdict is not Verdict.CANNOT_TELL), Verdict.CANNOT_TELL)
 
+    @property
+    def is_better(self) -> bool:
+        """Whether the verdict is `better`, and the interval of the difference that decides is above 0."""
+        decisive = (each for each in self.differences.values() if each.verdict is not Verdict.CANNOT_TELL)
+        first = next(decisive, None)
+        return first is not None and first.verdict is Verdict.BETTER and first.low > 0
+
+    def describe_loss(self, margin: float) -> str:
+        """Return by how much it may be worse, if that may be more than `margin`; empty for the same policy."""
+        (quantity, difference), *_ = self.differences.items()
+        if self.same_policy or difference.low >= -margin:
+            return ""
+        largest = f"{-difference.low:.3g}"
+        if difference.verdict is Verdict.WORSE:
+            return (
+                f"its {quantity} is lower by {-difference.mean:.3g}, perhaps by {largest}; --margin allows {margin:g}"
+            )
+        return f"its {quantity} may be lower by as much as {largest}; --margin allows {margin:g}"
+
 
 @dataclasses.dataclass(frozen=True)
 class RunComparison:
@@ -109,38 +135,43 @@ class RunComparison:
         """The baseline, then the candidates' sides."""
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
 
-    def list_missed(self, margin: float | None = None, *, allow_no_success: bool = False) -> list[str]:
+    def list_missed(
+        self, margin: float | None = None, *, allow_no_success: bool = False, better: bool = False
+    ) -> list[str]:
         """Return a phrase for each candidate that misses the gate, see `find_missed`."""
-        return list(self.find_missed(margin, allow_no_success=allow_no_success).values())
+        return list(self.find_missed(margin, allow_no_success=allow_no_success, better=better).values())
 
-    def find_missed(self, margin: float | None = None, *, allow_no_success: bool = False) -> dict[str, str]:
+    def find_missed(
+        self, margin: float | None = None, *, allow_no_success: bool = False, better: bool = False
+    ) -> dict[str, str]:
         """Return the candidates that are worse than the baseline; with `margin`, that may be by more, with a phrase.
 
         `margin` is a success rate, and only success counts then; or a return if the task reports no success. A
         candidate with the same policy is neither. A candidate that never succeeds, as the baseline, is not worse but
-        does nothing; it misses the gate too, unless `allow_no_success`.
+        does nothing; it misses the gate too, unless `allow_no_success`. With `better` all candidates miss the gate
+        that are not shown to be better, see `Candidate.is_better`.
         """
         missed = {}
         for candidate in self.candidates:
             name = candidate.side.name
             if candidate.side.never_succeeds and self.baseline.never_succeeds and not allow_no_success:
-                missed[name] = (
-                    f"{name}: not worse, but both succeed in none of {self.episodes} episodes, so nothing is shown; "
+                problem = (
+                    f"not worse, but both succeed in none of {self.episodes} episodes, so nothing is shown; "
                     "--allow-no-success lets that pass"
                 )
+            elif better:
+                problem = "" if candidate.is_better else f"not shown to be better than {self.baseline.label}"
             elif margin is None:
-                if candidate.verdict is Verdict.WORSE:
-                    missed[name] = f"{name}: worse than {self.baseline.name}"
-            elif not candidate.same_policy:
-                (quantity, difference), *_ = candidate.differences.items()
-                if difference.low < -margin:
-                    loss = f"its {quantity} may be lower by {-difference.low:.3g}, more than {margin:g}"
-                    missed[name] = f"{name}: {loss}"
+                problem = f"worse than {self.baseline.label}" if candidate.verdict is Verdict.WORSE else ""
+            else:
+                problem = candidate.describe_loss(margin)
+            if problem:
+                missed[name] = f"{candidate.side.label}: {problem}"
         return missed
 
-    def check(self, margin: float | None = None, *, allow_no_success: bool = False) -> None:
+    def check(self, margin: float | None = None, *, allow_no_success: bool = False, better: bool = False) -> None:
         """Raise `AnswerIsNo` for what `list_missed` returns."""
-        if missed := self.list_missed(margin, allow_no_success=allow_no_success):
+        if missed := self.list_missed(margin, allow_no_success=allow_no_success, better=better):
             raise AnswerIsNo(f"gate missed: {'; '.join(missed)}")
 
 
@@ -216,6 +247,8 @@ def compare_runs(
         known = first.evaluation if twin else None
         evaluated = [first if run is groups[0][0] else _evaluate(run, request, threshold, known) for run in group]
         sides.append(Side(name=name, runs=evaluated, mixed=find_mixed(own)))
+    if of_recipes:
+        sides = _name_by_difference(sides, [own[0] for own in recipes])
     baseline, *others = sides
     return RunComparison(
         of_recipes=of_recipes,
@@ -235,6 +268,14 @@ def compare_runs(
         episodes=request.episodes,
         threshold=_default_threshold(threshold, baseline.has_success),
     )
+
+
+def _name_by_difference(sides: Sequence[Side], recipes: Sequence[Recipe]) -> list[Side]:
+    """Name recipes by what differs, unless that names two alike, as where they began with other policies."""
+    differences = name_recipes(recipes)
+    if "" in differences or len(set(differences)) < len(differences):
+        return list(sides)
+    return [dataclasses.replace(side, difference=text) for side, text in zip(sides, differences, strict=True)]
 
 
 def _find_other_starts(run: RunDirectory, baseline: RunDirectory) -> dict[str, tuple[Any, Any]]:

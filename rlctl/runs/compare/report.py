@@ -13,6 +13,8 @@ from rlctl.runs.compare.comparison import Candidate, EvaluatedRun, RunComparison
 from rlctl.storage.junit import Suite, make_gate_case
 from rlctl.version import collect_versions
 
+NOT_WORSE, BETTER = "not-worse", "better"  # the gates
+
 
 def make_suite(
     result: RunComparison,
@@ -21,9 +23,12 @@ def make_suite(
     has_gate: bool,
     margin: float | None = None,
     allow_no_success: bool = False,
+    better: bool = False,
 ) -> Suite:
     """Return a test case for each candidate, which fails where it misses the gate; it took so long [s]."""
-    missed = result.find_missed(margin, allow_no_success=allow_no_success) if has_gate else {}
+    missed = {}
+    if has_gate:
+        missed = result.find_missed(margin, allow_no_success=allow_no_success, better=better)
     cases = []
     for candidate in result.candidates:
         name = candidate.side.name
@@ -44,9 +49,11 @@ def show(
 ) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
     has_gate = gate is not None or margin is not None
-    missed = result.list_missed(margin, allow_no_success=allow_no_success) if has_gate else []
+    missed = []
+    if has_gate:
+        missed = result.list_missed(margin, allow_no_success=allow_no_success, better=gate == BETTER)
     verdict = judge("runs compare", missed, has_gate=has_gate)
-    gates = {"gate": "not-worse" if has_gate else None, "margin": margin}
+    gates = {"gate": (gate or NOT_WORSE) if has_gate else None, "margin": margin}
     if output.present(as_json(result) | verdict | gates, json):
         return
     out = output.out()
@@ -61,7 +68,7 @@ def show(
         out.print(f"all runs were evaluated with the baseline's {', '.join(result.world_differences)}")
     out.print(describe_tests(result))
     for candidate in result.candidates:
-        question = f"\n{candidate.side.name} against {result.baseline.name}: "
+        question = f"\n{candidate.side.label} against {result.baseline.label}: "
         out.print(Text.assemble(question, (candidate.verdict, "bold")))
         lines = describe_candidate(result, candidate)
         for key, (value, before) in (candidate.recipe_changes or {}).items():
@@ -74,18 +81,18 @@ def _show_seeds(result: RunComparison) -> None:
     columns = ["recipe", "seed", "success", "return"]
     if result.threshold is not None:
         columns += [f"steps to {result.threshold:g}", f"seconds to {result.threshold:g}"]
-    rows = [(side.name, *_format_seed(run))[: len(columns)] for side in result.sides for run in side.runs]
+    rows = [(side.label, *_format_seed(run))[: len(columns)] for side in result.sides for run in side.runs]
     output.print_table(columns, rows, left=("recipe",))
     for side in result.sides:
         output.out().print(describe_seeds(result, side))
         if side.mixed:
-            output.out().print(f"warning: {side.name} is not one recipe: its runs differ in {', '.join(side.mixed)}")
+            output.out().print(f"warning: {side.label} is not one recipe: its runs differ in {', '.join(side.mixed)}")
 
 
 def describe_seeds(result: RunComparison, side: Side) -> str:
     """Return a recipe's scores in the episodes of the comparison."""
     scores = "; ".join(_format_aggregate(side, quantity) for quantity in result.candidates[0].differences)
-    return f"{side.name}: {len(side.runs)} seeds, {scores}"
+    return f"{side.label}: {len(side.runs)} seeds, {scores}"
 
 
 def _or_dash(value: float | None, form: str) -> str:
@@ -102,12 +109,15 @@ def _format_seed(run: EvaluatedRun) -> tuple[str, ...]:
 
 
 def _format_aggregate(side: Side, quantity: significance.Quantity) -> str:
-    """Return `success mean 97.0%, IQM 97.5% (95 % interval 95.0% to 99.0%)`."""
+    """Return `success mean 97.0%, IQM 97.5% (95 % interval 95.0% to 99.0%)`; of few seeds their range."""
     scores = side.scores(quantity)
     spread, interval = Spread.of(scores.tolist()), significance.interquartile_mean_interval(scores)
+    what = "95 % interval"
+    if interval is None:
+        what, interval = f"range of {scores.size} seeds", (float(scores.min()), float(scores.max()))
     form = ".1%" if quantity == "success" else ".4g"
     mean, middle, low, high = (format(value, form) for value in (spread.mean, spread.iqm, *interval))
-    return f"{quantity} mean {mean}, IQM {middle} (95 % interval {low} to {high})"
+    return f"{quantity} mean {mean}, IQM {middle} ({what} {low} to {high})"
 
 
 def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:
@@ -214,4 +224,4 @@ def _side_as_json(side: Side, result: RunComparison) -> dict[str, Any]:
         scores = side.scores(quantity)
         interval = significance.interquartile_mean_interval(scores)
         over_seeds[quantity] = {**vars(Spread.of(scores.tolist())), "iqm_interval": interval}
-    return {"name": side.name, "runs": runs, "over_seeds": over_seeds, "mixed": side.mixed}
+    return {"name": side.name, "label": side.label, "runs": runs, "over_seeds": over_seeds, "mixed": side.mixed}

@@ -23,6 +23,7 @@ ALPHA = 0.05  # a difference is significant below this p-value; intervals have t
 POWER = 0.8
 _RESAMPLES = 9999
 _NORMAL = statistics.NormalDist()
+_LEAST_TO_RESAMPLE = 5  # seeds of which a bootstrap is an interval
 _LEAST_PAIRS, _LEAST_SEEDS = 6, 4  # the fewest differing pairs, and seeds per recipe, that can reach `ALPHA`
 
 
@@ -193,8 +194,14 @@ def find_least_pairs(margin: float) -> float:
     return max(2, math.ceil(_NORMAL.inv_cdf(1 - ALPHA / 2) / margin) - 2) if margin > 0 else math.inf
 
 
-def interquartile_mean_interval(scores: Array) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,)."""
+def interquartile_mean_interval(scores: Array) -> tuple[float, float] | None:
+    """Return the 95 % bootstrap interval of the interquartile mean over seeds, shape (seeds,).
+
+    None for fewer than `_LEAST_TO_RESAMPLE`: the interval of two seeds would be their range, which covers the
+    median of all seeds in half of the cases only.
+    """
+    if scores.size < _LEAST_TO_RESAMPLE:
+        return None
     from scipy.stats import trim_mean
 
     return _interval((scores,), lambda values, axis=-1: trim_mean(values, 0.25, axis=axis))

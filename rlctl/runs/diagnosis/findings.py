@@ -1,4 +1,4 @@
-"""Findings of a training, from its run folder: Q1 to Q14, each with its evidence and what to try.
+"""Findings of a training, from its run folder: Q1 to Q15, each with its evidence and what to try.
 
 A single sign proves little: in a perfect training of `reach`, three of four updates have `approx_kl > 0.03`. So a
 finding is a combination of signs; `findings.yaml` has the combinations and all texts.
@@ -8,21 +8,17 @@ import dataclasses
 import enum
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import yaml
-
 from rlctl.errors import UsageError, check_name
-from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.runs.diagnosis import episode_signs, record_signs, signs
 from rlctl.runs.diagnosis.history import RunHistory
+from rlctl.runs.diagnosis.usual_ranges import Setting, read_table
 from rlctl.runs.directory import RunDirectory
 
 _NOT = "not "
-_FAR_OUT = 5.0
-"""Factor outside of its usual range from which a hyperparameter is the first suspect."""
+_UNUSUAL = "Q15"
 
 
 class Grade(enum.StrEnum):
@@ -33,25 +29,17 @@ class Grade(enum.StrEnum):
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
-    """A hyperparameter that may need another value."""
-
-    name: str
-    value: Any  # the value in the recipe, or SB3's default
-    advice: str  # its usual range and value, and what raising and lowering it does
-
-
-@dataclasses.dataclass(frozen=True)
 class Finding:
     """A problem that the records of a training show."""
 
-    id: str  # Q1 to Q14
+    id: str  # Q1 to Q15
     name: str
     grade: Grade
     evidence: list[str]  # the numbers that show it
     meaning: str
     advice: list[str]
     settings: list[Setting]
+    follows: str = ""  # the id of another finding of the same run that probably causes this one
 
     @property
     def line(self) -> str:
@@ -59,11 +47,9 @@ class Finding:
         return f"{self.grade}: {self.id} {self.name}: {'; '.join(self.evidence)}"
 
 
-@functools.cache
-def _texts() -> dict[str, Any]:
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where PyYAML has it
-    text = Path(__file__).with_name("findings.yaml").read_text(encoding="utf-8")
-    return yaml.load(text, loader)  # noqa: S506
+def _texts() -> Sequence[dict[str, Any]]:
+    texts: Sequence[dict[str, Any]] = read_table("findings.yaml")["findings"]
+    return texts
 
 
 def list_signs() -> dict[str, signs.Sign]:
@@ -81,13 +67,47 @@ def diagnose(run: RunDirectory | RunHistory) -> list[Finding]:
     history = run if isinstance(run, RunHistory) else RunHistory(run)
     functions = list_signs()
     read_sign = functools.cache(lambda name: functions[name](history))
-    texts = _texts()["findings"]
+    texts = _texts()
     specific = [text for text in texts if not text.get("alone")]
     findings = [finding for text in specific if (finding := _check(text, read_sign, history)) is not None]
     if all(finding.grade != Grade.WARNING for finding in findings):
         general = [text for text in texts if text.get("alone")]
         findings += [finding for text in general if (finding := _check(text, read_sign, history)) is not None]
-    return sorted(findings, key=lambda finding: list(Grade).index(finding.grade))
+    findings = _mark_followers(_drop_unusual(findings))
+    return sorted(findings, key=lambda finding: (list(Grade).index(finding.grade), bool(finding.follows)))
+
+
+def _drop_unusual(findings: Sequence[Finding]) -> list[Finding]:
+    """Leave `_UNUSUAL` out if a finding that explains others has all its values among its settings."""
+    named = {
+        setting.name
+        for finding in findings
+        if finding.id != _UNUSUAL and _list_explained(finding)
+        for setting in finding.settings
+    }
+    return [
+        finding
+        for finding in findings
+        if finding.id != _UNUSUAL or any(s.is_far_out and s.name not in named for s in finding.settings)
+    ]
+
+
+def _mark_followers(findings: Sequence[Finding]) -> list[Finding]:
+    """Give each warning that another one probably causes the other one's id."""
+    causes = {id: finding.id for finding in findings for id in _list_explained(finding)}
+    return [
+        dataclasses.replace(finding, follows=causes[finding.id])
+        if finding.id in causes and finding.grade == Grade.WARNING
+        else finding
+        for finding in findings
+    ]
+
+
+def _list_explained(finding: Finding) -> list[str]:
+    """Return the ids of the findings that this one explains."""
+    return next(
+        (text.get("explains", []) for text in _texts() if (text["id"], text["name"]) == (finding.id, finding.name)), []
+    )
 
 
 def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history: RunHistory) -> Finding | None:
@@ -107,39 +127,13 @@ def _check(text: dict[str, Any], read_sign: Callable[[str], str | None], history
         evidence=list(dict.fromkeys(sign for sign in evidence if sign is not None)),
         meaning=text["meaning"],
         advice=[advice.replace("RUN", str(history.run.path)).replace("TASK", task) for advice in text["try"]],
-        settings=_settings(text["settings"], history),
+        settings=history.list_settings(text["settings"]),
     )
-
-
-def _settings(names: Iterable[str], history: RunHistory) -> list[Setting]:
-    """Return the hyperparameters that the algorithm has, those that are farthest out of their usual range first."""
-    settings = []
-    for name in names:
-        row = _texts()["settings"][name]
-        if name not in history.parameters or (row.get("on_policy") and history.recipe.get("algo") not in ON_POLICY):
-            continue
-        value = history.parameters[name]
-        factor = _count_times_out(value, row["range"])
-        advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
-        if factor >= _FAR_OUT:
-            advice = f"{factor:.0f} times out of its usual range; {advice}"
-        settings.append((factor, Setting(name, value, advice)))
-    ordered = sorted(settings, key=lambda pair: -pair[0] if pair[0] >= _FAR_OUT else 0.0)
-    return [setting for _, setting in ordered]
-
-
-def _count_times_out(value: object, usual: str) -> float:
-    """Return by what factor a value is above or below the range `LOW to HIGH`; 1 inside."""
-    low, high = (float(end) for end in usual.split(" to "))
-    number = record_signs.read_first_value(value)
-    if number is None or number <= 0:
-        return 1.0
-    return max(1.0, number / high, low / number)
 
 
 def explain(code: str) -> list[str]:
     """Return what the findings of an id (`Q10`) mean, and what to try; raises `UsageError` for an unknown id."""
-    findings = _texts()["findings"]
+    findings = _texts()
     check_name(
         code.upper(), dict.fromkeys(text["id"] for text in findings), "no finding", UsageError, listed="There are"
     )
@@ -161,9 +155,24 @@ def format_finding(finding: Finding) -> list[str]:
     return [finding.line, f"  {finding.meaning}", *(f"  try: {advice}" for advice in finding.advice), *settings]
 
 
+def format_findings(findings: Sequence[Finding]) -> list[str]:
+    """Return findings in full, and in a line those that probably follow from another one."""
+    lines = [line for finding in findings if not finding.follows for line in format_finding(finding)]
+    return [*lines, *list_followers(findings)]
+
+
+def list_followers(findings: Sequence[Finding]) -> list[str]:
+    """Return a line for each finding that others probably follow from."""
+    followers: dict[str, list[str]] = {}
+    for finding in findings:
+        if finding.follows:
+            followers.setdefault(finding.follows, []).append(f"{finding.id} {finding.name}")
+    return [f"may follow from {cause}: {', '.join(names)}" for cause, names in followers.items()]
+
+
 def format_end(findings: Sequence[Finding], run: str) -> list[str]:
-    """Return the lines at the end of a training: warnings in full, other findings in one line."""
+    """Return the lines at the end of a training: warnings as `format_findings`, other findings in one line."""
     warnings = [finding for finding in findings if finding.grade == Grade.WARNING]
     others = [f"{finding.id} {finding.name}" for finding in findings if finding.grade != Grade.WARNING]
-    lines = [line for finding in warnings for line in format_finding(finding)]
+    lines = format_findings(warnings)
     return [*lines, f"also noted: {', '.join(others)}; details: rlctl runs show {run}"] if others else lines

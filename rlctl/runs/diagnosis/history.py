@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +16,8 @@ from rlctl.play.episode import RecordedEpisode, load_episode
 from rlctl.policy.file import PolicyFile
 from rlctl.recipe import recipe, sources
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
+from rlctl.runs.diagnosis import usual_ranges
+from rlctl.runs.diagnosis.usual_ranges import Setting
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.tables import Rows, list_points, read_table
 
@@ -109,6 +111,20 @@ class RunHistory:
         """The parameters of the algorithm as the recipe has them, or SB3's defaults."""
         fields = getattr(ALGORITHM_PARAMETERS.get(self.recipe.get("algo", "")), "model_fields", {})
         return {name: field.default for name, field in fields.items()} | (self.recipe.get("algo_kwargs") or {})
+
+    @property
+    def n_envs(self) -> int:
+        """The number of environments that are stepped in parallel."""
+        n_envs = self.recipe.get("n_envs")
+        return n_envs if isinstance(n_envs, int) else int(recipe.Recipe.model_fields["n_envs"].default)
+
+    def list_settings(self, names: Iterable[str]) -> list[Setting]:
+        """Return hyperparameters with what is usual, see `usual_ranges.list_settings`."""
+        return usual_ranges.list_settings(names, self.parameters, self.recipe.get("algo"), self.n_envs)
+
+    def find_far_out(self) -> list[Setting]:
+        """Return the hyperparameters that are far out of their usual range."""
+        return usual_ranges.find_far_out(self.parameters, self.recipe.get("algo"), self.n_envs)
 
     @functools.cached_property
     def env(self) -> EnvInfo | None:

@@ -8,6 +8,7 @@ import numpy as np
 from rlctl.output import format_count
 from rlctl.recipe.hindsight import has_sparse_reward, suggest_hindsight
 from rlctl.recipe.recipe import Recipe
+from rlctl.runs.diagnosis import usual_ranges
 from rlctl.runs.diagnosis.history import FEW_ROWS, LEAST_ROWS, Curve, RunHistory
 
 _USUAL_RATE = 1e-3  # the most that is usual
@@ -74,16 +75,13 @@ def updates_are_large(run: RunHistory) -> str | None:
 
 def learning_rate_is_far_above(run: RunHistory) -> str | None:
     """The learning rate is at least ten times the usual most."""
-    rate = read_first_value(run.parameters.get("learning_rate"))
+    rate = usual_ranges.read_first_value(run.parameters.get("learning_rate"))
     return f"learning rate {rate:g}" if rate is not None and rate >= 10 * _USUAL_RATE else None
 
 
-def read_first_value(setting: object) -> float | None:
-    """Return the value of a hyperparameter at the beginning, also of a schedule such as `lin_3e-4`."""
-    try:
-        return float(str(setting).rpartition("_")[2])
-    except ValueError:
-        return None
+def setting_is_far_out(run: RunHistory) -> str | None:
+    """A hyperparameter is far out of its usual range."""
+    return "; ".join(usual_ranges.describe(setting) for setting in run.find_far_out()) or None
 
 
 def policy_is_replaced(run: RunHistory) -> str | None:

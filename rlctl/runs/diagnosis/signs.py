@@ -39,6 +39,38 @@ def flat(run: RunHistory) -> str | None:
     return "; ".join(parts)
 
 
+def never_rises(run: RunHistory) -> str | None:
+    """The training began with an untrained policy, and its return never rises above the first one.
+
+    A training that learns before its first evaluation is flat too, but its first return is low.
+    """
+    curve = run.curve("return")
+    if len(curve) < LEAST_ROWS or run.stage_count or run.status.get("from") or run.status.get("demos"):
+        return None
+    window = max(2, len(curve) // 8)
+    best = float(np.convolve(curve.values[1:], np.full(window, 1 / window), "valid").max())
+    if best > curve.values[0] + 2 * curve.noise():
+        return None
+    return f"training return {curve.values[0]:.4g} at first, {best:.4g} at best later"
+
+
+def learned_little(run: RunHistory) -> str | None:
+    """The training is over; success is rare, or where none is reported the return is that of the beginning."""
+    if run.progress < 1 or run.is_good:
+        return None
+    if any(len(curve) for curve in run.successes):
+        return seldom_succeeds(run)
+    curve = run.curve("return")
+    if len(curve) < _LEAST_TO_FALL:
+        curve = run.evaluation_curve("return")
+    if len(curve) < _LEAST_TO_FALL:
+        return None
+    first, last = float(curve.values[0]), curve.thirds()[1]
+    if last > first + 3 * curve.noise():
+        return None
+    return f"return {first:.4g} at first, {last:.4g} in the last third"
+
+
 def no_longer_rises(run: RunHistory) -> str | None:
     """Evaluations reach the time limit, but their return hardly rises after the middle of the training."""
     returns, lengths = run.evaluation_curve("return"), run.evaluation_curve("length")

@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 
 from rlctl.environments import installed
-from rlctl.errors import ArtifactError, RlctlError, UsageError, short_repr
+from rlctl.errors import ArtifactError, RlctlError, UsageError
 from rlctl.output import format_duration
 from rlctl.play.episode import RecordedEpisode
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference
-from rlctl.recipe.stages import format_value
-from rlctl.runs.diagnosis.findings import Finding
+from rlctl.runs.diagnosis.findings import Finding, list_followers
 from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
-from rlctl.runs.report.show import RunDescription
+from rlctl.runs.recipe_names import name_recipes
+from rlctl.runs.report.show import RunDescription, list_changes
 from rlctl.runs.tables import Rows, list_points
 
-_SETTINGS_NAMED = 3  # in the name of a recipe
 _GOOD_SUCCESS = 0.5
 _TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")  # what rlctl names runs and groups by
 _COMPLETE = 0.95  # of the steps of the longest seed: rollouts end at slightly different steps
@@ -118,9 +117,7 @@ def _group_by_recipe(runs: Sequence[RunDescription], arguments: Mapping[Path, st
             groups.append((recipe, [run]))
         else:
             same.append(run)
-    changes = [find_difference(recipe, groups[0][0]) for recipe, _ in groups]
-    baseline = {key: before for change in changes for key, (_, before) in change.items()}
-    names = [_name_recipe(baseline | {key: value for key, (value, _) in change.items()}) for change in changes]
+    names = name_recipes([recipe for recipe, _ in groups])
     labels = names
     candidates = [
         [_find_argument(group, arguments) for _, group in groups],
@@ -161,17 +158,8 @@ def _find_algorithm(runs: Sequence[RunDescription]) -> str:
     return algorithms.pop() if len(algorithms) == 1 else ""
 
 
-def _name_recipe(settings: Mapping[str, Any]) -> str:
-    """Return `learning_rate 0.001, gamma 0.98`; of many settings the first."""
-    names = [
-        f"{key.rpartition('.')[2]} {short_repr(re.sub(r'[^ ]*/', '', format_value(key, value)), 30)}"
-        for key, value in settings.items()
-    ]
-    return ", ".join(names[:_SETTINGS_NAMED]) + (", ..." if len(names) > _SETTINGS_NAMED else "")
-
-
 def list_facts(report: RunReport) -> list[tuple[str, str]]:
-    """Return names and texts: task, start, duration, machine and versions."""
+    """Return names and texts: task, differences from its recipe, start, duration, machine and versions."""
     summaries = [run.summary for run in report.runs]
     task = summaries[0].task
     entry = installed.find(task)
@@ -186,12 +174,23 @@ def list_facts(report: RunReport) -> list[tuple[str, str]]:
         trained = f"{len(summaries)} trainings, {of_steps} steps each, {seconds} together"
     facts = {
         "Task": f"{task}: {summary}" if summary else task,
+        "Differs from the task's recipe": "; ".join(_list_changes(report)),
         "Started": " to ".join(dict.fromkeys((started[0], started[-1]))) + " UTC" if started else "",
         "Trained": trained,
         "Machine": "; ".join(host.strip(", ") for host in hosts),
         "Versions": ", ".join(f"{name} {version}" for name, version in summaries[0].versions.items()),
     }
     return [(name, text) for name, text in facts.items() if text]
+
+
+def _list_changes(report: RunReport) -> list[str]:
+    """Return what differs from the task's recipe, of several recipes each with its name."""
+    texts = []
+    for recipe in report.recipes:
+        changes = ", ".join(list_changes(recipe.runs[0].summary))
+        if changes:
+            texts.append(f"{recipe.name}: {changes}" if len(report.recipes) > 1 else changes)
+    return texts
 
 
 def summarize_result(runs: Sequence[RunDescription]) -> str:
@@ -229,21 +228,34 @@ def describe_absence(report: RunReport) -> str:
     rates = [run.summary.best_success for run in report.runs if run.summary.best_success is not None]
     if not rates or (best := max(rates)) >= _GOOD_SUCCESS:
         return f"Nothing unusual in the records of {which}."
+    run = next(run for run in report.runs if run.summary.best_success == best)
     return (
-        f"The records of {which} show no known mistake, but the best policy succeeds in only {best:.1%} of the "
-        "episodes: train longer, make the task easier first (stages), or look at an episode with rlctl replay."
+        f"No sign of a known mistake was found in the records of {which}, but the best policy succeeds in only "
+        f"{best:.1%} of the episodes. What has it learned instead? rlctl runs show "
+        f"{shlex.quote(str(run.summary.path))} --audit"
     )
 
 
 def collect_findings(report: RunReport) -> list[tuple[Finding, list[str]]]:
-    """Return the findings of all runs, each once, with the evidence of every run."""
+    """Return the findings of all runs, each once, with the evidence of every run; without those that only follow."""
     findings: dict[str, tuple[Finding, list[str]]] = {}
     for run in report.runs:
         for finding in run.findings:
+            if finding.follows:
+                continue
             seed = f"seed {run.summary.seed}: " if len(report.runs) > 1 else ""
             _, evidence = findings.setdefault(f"{finding.id} {finding.name}", (finding, []))
             evidence.append(seed + "; ".join(finding.evidence))
     return list(findings.values())
+
+
+def collect_followers(report: RunReport) -> list[str]:
+    """Return a line for each finding of a run that others probably follow from."""
+    lines = []
+    for run in report.runs:
+        seed = f"seed {run.summary.seed}: " if len(report.runs) > 1 else ""
+        lines += [seed + line for line in list_followers(run.findings)]
+    return lines
 
 
 def list_commands(report: RunReport) -> list[str]:

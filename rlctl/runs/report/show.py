@@ -12,15 +12,16 @@ from rlctl import output
 from rlctl.errors import ArtifactError
 from rlctl.evaluation import robustness
 from rlctl.evaluation.robustness import Robustness
+from rlctl.recipe.recipe import NOT_SET
 from rlctl.recipe.stages import format_value
 from rlctl.runs.best import describe_unevaluated_last
-from rlctl.runs.diagnosis.findings import diagnose, format_finding
+from rlctl.runs.diagnosis.findings import diagnose, format_findings
 from rlctl.runs.diagnosis.history import RunHistory
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import as_json
 from rlctl.runs.lookup import describe_source_change
 from rlctl.runs.report.audited import list_lines, read_audit
-from rlctl.runs.summary import summarize
+from rlctl.runs.summary import RunSummary, summarize
 from rlctl.runs.tables import Rows, list_points
 
 _EVALUATIONS_SHOWN = 12
@@ -114,11 +115,8 @@ def show(run: RunDescription, json: str | None) -> None:
         out.print(f"best evaluation at step {summary.best_step:,}: {success}return {summary.best_return:.4g}")
     if isinstance(source := run.status.get("from"), dict):
         out.print(f"started from {source.get('policy')}, step {source.get('training_steps')}")
-    for key, value in summary.changes.items():
-        before = ""
-        if key in summary.changed_from:
-            before = f" (recipe: {format_value(key, summary.changed_from[key])})"
-        out.print(f"differs from the task's recipe: {key} = {format_value(key, value)}{before}")
+    for change in list_changes(summary):
+        out.print(f"differs from the task's recipe: {change}")
     for warning in run.warnings:
         out.print(f"warning: {warning}")
     for name in ("success", "return"):
@@ -131,10 +129,22 @@ def show(run: RunDescription, json: str | None) -> None:
         out.print(line)
     if run.audit is None and summary.best_success is not None and summary.best_success < _POOR_SUCCESS:
         out.print(f"what has it learned instead? rlctl runs show {shlex.quote(str(summary.path))} --audit")
-    for finding in run.findings:
-        out.print("\n".join(format_finding(finding)))
+    for line in format_findings(run.findings):
+        out.print(line)
     files = "  ".join(f"{name} {format_bytes(size)}" for name, size in sizes.items())
     out.print(f"files: {files}  in {summary.path}")
+
+
+def list_changes(summary: RunSummary) -> list[str]:
+    """Return `reward_weights.action = -50.0 (recipe: -0.05)` for each key that differs from the task's recipe."""
+    changes = []
+    for key, value in summary.changes.items():
+        before = ""
+        if key in summary.changed_from:
+            text = format_value(key, summary.changed_from[key])
+            before = " (not set there)" if text == NOT_SET else f" (recipe: {text})"
+        changes.append(f"{key} = {format_value(key, value)}{before}")
+    return changes
 
 
 def plot(run: RunDescription, name: str) -> str:

@@ -126,6 +126,7 @@ def _values(report: RunReport, is_html: bool, pictures: bool, episodes: int) -> 
         "facts": content.list_facts(report),
         "notes": [*notes, *report.notes],
         "findings": content.collect_findings(report),
+        "followers": content.collect_followers(report),
         "absence": content.describe_absence(report),
         "runs": [
             (f"{run.summary.name}{recipe.name and f' ({recipe.name})'}", _split_terms(run.evaluations))
