@@ -109,7 +109,8 @@ def _body(model: Any, root: int) -> WorldBody:
 def _joint(model: Any, joint: int) -> Joint:
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (0.0, -1.0)
     name = model.joint(joint).name or f"joint {joint}"
-    return Joint(joint, name, int(model.jnt_type[joint]) != SLIDE, float(low), float(high))
+    link = model.body(int(model.jnt_bodyid[joint])).name
+    return Joint(joint, name, int(model.jnt_type[joint]) != SLIDE, float(low), float(high), link)
 
 
 def _motor(model: Any, actuator: int) -> JointActuator | None:

@@ -37,6 +37,7 @@ class Joint:
     is_angle: bool
     low: float
     high: float
+    link: str = ""  # The name of the part that it moves, where a body is a tree of named ones
 
     @property
     def has_limits(self) -> bool:
@@ -54,6 +55,10 @@ class WorldBody:
     joints: tuple[Joint, ...]
     is_free: bool  # Whether its base is not fixed to the world
     has_heavy_links: bool  # Whether it has joints, and anything beside its base has a mass
+
+    def name_joint(self, joint: Joint) -> str:
+        """Return `elbow of lower`: a joint with the part that it moves, or with the whole body."""
+        return f"{joint.name} of {joint.link or self.name}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -92,7 +92,7 @@ class Gates:
         highest = find_interval(episodes, episodes)[0] if decide_early else 0.025 ** (1 / episodes)  # Clopper, Pearson
         if lower > highest:
             needed = find_least_episodes(lower) if decide_early else _count_successes(lower)
-            enough = f"; {needed:,} can" if needed else ""
+            enough = f"; use --episodes {needed}" if needed else ""
             raise UsageError(f"--min-success-lower {lower:g}: {episodes} successes reach at most {highest:.3f}{enough}")
 
     def choose_early(self, has_limits: bool) -> EarlyGate:

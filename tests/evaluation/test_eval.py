@@ -164,7 +164,9 @@ def test_gates(evaluation, gates, message):
 def test_a_bound_that_no_episodes_reach_is_refused_before_they_are_played(reach_run):
     request = EvalRequest(str(reach_run.path), episodes=20)
     # 0.025 ** (1 / 20) = 0.8316; log 0.025 / log 0.9 = 35.01
-    with pytest.raises(UsageError, match=r"--min-success-lower 0\.9: 20 successes reach at most 0\.832; 36 can$"):
+    with pytest.raises(
+        UsageError, match=r"--min-success-lower 0\.9: 20 successes reach at most 0\.832; use --episodes 36$"
+    ):
         run_evaluation(request, Gates(min_success_lower=0.9))
     with pytest.raises(UsageError, match=r"--min-success-lower 1: 20 successes reach at most 0\.832$"):
         run_evaluation(request, Gates(min_success_lower=1.0))

@@ -95,7 +95,7 @@ def test_a_lower_end_that_cannot_be_reached_is_refused_before_playing(rlctl):
     done = rlctl("eval", "reach", "--policy", "zero", "--min-success-lower", "0.95", "--decide-early")
     assert done.returncode == 2
     # (0.05 / 101)^(1 / 100) = 0.927; 0.95^n <= 0.05 / (n + 1) from n = 158 on.
-    assert done.stderr == "error: --min-success-lower 0.95: 100 successes reach at most 0.927; 158 can\n"
+    assert done.stderr == "error: --min-success-lower 0.95: 100 successes reach at most 0.927; use --episodes 158\n"
 
 
 def test_what_the_remaining_episodes_cannot_change():

@@ -50,7 +50,7 @@ def _find_joints_beyond_limits(world: LoggedWorld) -> Iterator[ChildMessage]:
                 outside = measure_outside(joint, positions)
                 steps, row = int((outside > 0).sum()), int(outside.argmax())
                 if _is_kept_there(log, outside):
-                    name, place = f"{joint.name} of {body.name}", log.places[row]
+                    name, place = body.name_joint(joint), log.places[row]
                     joints.append((float(outside[row]), name, joint, steps, place, float(positions[row])))
     joints.sort(key=lambda record: -record[0])
     names = list(dict.fromkeys(record[1] for record in joints))

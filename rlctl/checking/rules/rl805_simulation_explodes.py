@@ -59,7 +59,7 @@ def _fast(log: WorldLog, body: WorldBody, states: Array) -> Iterator[tuple[float
     parts = [(body.name, "m/s", fastest, linear), (body.name, "rad/s", FASTEST_JOINT, angular)]
     for joint, speeds in zip(body.joints, np.abs(states[:, JOINTS + len(body.joints) :]).T, strict=True):
         unit, limit = ("rad/s", FASTEST_JOINT) if joint.is_angle else ("m/s", FASTEST_SLIDE)
-        parts.append((f"{joint.name} of {body.name}", unit, limit, speeds))
+        parts.append((body.name_joint(joint), unit, limit, speeds))
     for part, unit, limit, speeds in parts if log.actions != "extreme" else ():
         row = int(np.argsort(speeds)[-min(LASTING_STEPS, len(speeds))])
         speed, place = float(speeds[row]), log.places[row]

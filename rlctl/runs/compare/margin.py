@@ -14,7 +14,7 @@ def check_margin(margin: float, episodes: int, *, of_success: bool) -> None:
         raise UsageError(f"--margin {margin:g}: a success rate is at most 1; 5 points are 0.05")
     if (loss := find_smallest_loss(episodes)) > margin:
         needed = find_least_pairs(margin)
-        enough = f"--episodes {needed:,} or more can" if math.isfinite(needed) else "no number of episodes can"
+        enough = f"--episodes {needed} or more can" if math.isfinite(needed) else "no number of episodes can"
         raise UsageError(
             f"--margin {margin:g}: {episodes} episodes cannot exclude that success is lower by {loss:.3g}, even if all "
             f"are equal; {enough}"
