@@ -40,7 +40,7 @@ from rlctl.task.task import Task, check_definition, check_parameters
 
 RenderMode = Literal["human", "rgb_array"] | None
 
-_MARKER_RADIUS, _MARKER_COLOR = 0.01, (0.1, 0.8, 0.3, 0.8)  # [m]; hides neither a peg nor a block; films add a ring
+_MARKER_RADIUS, _MARKER_COLOR = 0.02, (0.1, 0.8, 0.3, 0.8)  # [m]; seen, and hides little; films add a ring
 
 
 class WorldsStep(NamedTuple):
