@@ -121,6 +121,8 @@ def show(result: TrainResult, json: str | None) -> None:
         return
     lines = [result.note] if result.note else []
     lines += [*_format_result(result), *format_end(findings, shlex.quote(str(result.run.path)))]
+    if not findings and _never_succeeds(result):
+        lines.append("no known mistake in the records: --audit, below, tells what was learned instead")
     lines += [f"recording: rerun {shlex.quote(str(path))}" for path in result.recordings]
     if result.recordings:
         lines.append("  without a display, in a browser: rerun --serve-web FILE")
@@ -132,11 +134,14 @@ def show(result: TrainResult, json: str | None) -> None:
 def list_next_commands(result: TrainResult) -> list[str]:
     """Return the next commands: export, or for a policy that never succeeded what it has learned instead."""
     run = shlex.quote(str(result.run.path))
-    score = result.best.evaluation if result.best else None
-    fails = score is not None and score.success == 0
     tensorboard = f"tensorboard --logdir {shlex.quote(str(result.run.tensorboard))}"
-    second = f"rlctl runs show {run} --audit" if fails else f"rlctl export {run} --onnx"
+    second = f"rlctl runs show {run} --audit" if _never_succeeds(result) else f"rlctl export {run} --onnx"
     return [f"rlctl eval {run}", second, f"rlctl replay {run}", tensorboard]
+
+
+def _never_succeeds(result: TrainResult) -> bool:
+    score = result.best.evaluation if result.best else None
+    return score is not None and score.success == 0
 
 
 def _to_json(result: TrainResult, findings: list[Finding]) -> dict[str, Any]:

@@ -173,8 +173,8 @@ def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
         lines.append(f"START of {', '.join(others)} is kept")
     if arm.keyframe:
         lines.append(f"START is the keyframe {arm.keyframe!r} of the file")
-    if arm.motors is None and _has_actuators(arm.path):
-        lines.append("The file's actuators are not used: the task's act() drives the joints")
+    if unused := _list_unused(arm.path):
+        lines.append(f"Not used of the file: {', '.join(unused)}; the task's act() drives the joints (docs/mujoco.md)")
     if arm.height:
         lines.append(f"It is {arm.height:g} m above the floor, into which it hangs otherwise")
     if only_mujoco:
@@ -184,10 +184,19 @@ def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
     return ".\n".join(lines)
 
 
-def _has_actuators(path: Path) -> bool:
+def _list_unused(path: Path) -> list[str]:
+    """Return what a starter does not use of an MJCF file and users expect."""
     import mujoco
 
-    return path.suffix == ".xml" and len(mujoco.MjSpec.from_file(str(path)).actuators) > 0
+    if path.suffix != ".xml":
+        return []
+    spec = mujoco.MjSpec.from_file(str(path))
+    found = {
+        "actuators": bool(spec.actuators),
+        "<option>": b"<option" in path.read_bytes(),
+        "<exclude> and <pair>": bool(spec.excludes or spec.pairs),
+    }
+    return [name for name, is_there in found.items() if is_there]
 
 
 def list_faults(body: MujocoBody) -> list[str]:

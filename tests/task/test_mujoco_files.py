@@ -264,3 +264,12 @@ def test_refused_files_are_named_in_one_line(tmp_path, name, text, message):
         make_sim().load("robot", file)
     assert "\n" not in str(caught.value)
     assert Path(name).name in str(caught.value)
+
+
+def test_an_actuator_of_a_joint_that_is_not_there_is_what_mujoco_says(tmp_path):
+    (tmp_path / "robot.xml").write_text(
+        """<mujoco><worldbody><body name="foot"><joint name="lift"/><geom size="0.1"/></body></worldbody>
+        <actuator><motor name="servo" joint="lifd"/></actuator></mujoco>"""
+    )
+    with pytest.raises(TaskError, match=r"MuJoCo cannot load .*robot.xml: .*'lifd'"):
+        make_sim().load("robot", tmp_path / "robot.xml")

@@ -151,7 +151,7 @@ def test_sites_and_keyframe_of_an_mjcf_file_are_used(name, asked, tip, point, tm
     lines = plugin.summary.split(".\n")
     assert f"lift, wrist of arm.xml bring {tip} to a goal" in lines
     assert "START is the keyframe 'home' of the file" in lines
-    assert "The file's actuators are not used: the task's act() drives the joints" in lines
+    assert "Not used of the file: actuators; the task's act() drives the joints (docs/mujoco.md)" in lines
     with contextlib.closing(EnvSpec(plugin.target, sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         task = env.unwrapped.task

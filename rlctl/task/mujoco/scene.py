@@ -177,8 +177,22 @@ class MujocoScene:
         _keep_changes(model, new_model)
         _keep_state(model, data, new_model, new_data)
         for parts in self.parts.values():
-            parts.bind(new_model)
+            try:
+                parts.bind(new_model)
+            except KeyError:  # attaching leaves out what refers to nothing, and says nothing
+                self._explain_missing(parts)
+                raise
         return new_model, new_data
+
+    def _explain_missing(self, parts: Parts) -> None:
+        """Raise `TaskError` with what MuJoCo says of a model file alone, if it does."""
+        path = parts.file.path
+        if path.suffix != ".xml":
+            return
+        try:
+            self.mujoco.MjSpec.from_file(str(path)).compile()
+        except ValueError as error:
+            raise TaskError(f"MuJoCo cannot load {path}: {' '.join(str(error).split())}") from None
 
     def _attach(self, child: Any, name: str, frame: Any) -> None:
         # Where a model has files in memory, `attach` puts the prefix before the names of all other files.
