@@ -18,13 +18,10 @@ from rlctl.training.updates.perceptrons import Floats, MlpStack
 
 @dataclasses.dataclass(frozen=True)
 class _Normalized:
-    """How a layer's inputs were normalized; arrays have the shape (networks, 1, size).
+    """Inputs of a layer, shape (networks, batch, size), and how they were normalized; the rest (networks, 1, size)."""
 
-    normalized = inputs * factor + shift, before the layer's own scale and bias.
-    """
-
-    inputs: Floats  # shape (networks, batch, size); with learning minus their mean
-    factor: Floats
+    centered: Floats  # minus their mean
+    factor: Floats  # normalized = centered * factor + shift, before the layer's own scale and bias
     shift: Floats
     # Derivatives of the variance that normalizes, and of the mean, by the batch's variance; None without learning.
     var_by_var: Floats | None = None
@@ -32,32 +29,33 @@ class _Normalized:
 
 
 class _Renorm:
-    """Layers of equal size, one per network, whose parameters and statistics become slices of shared arrays.
-
-    Scale and bias never touch the batch: the linear layer behind takes them into its weights, and the sums of their
-    gradients follow from the gradient of those weights. A batch has more elements than a layer has weights.
-    """
+    """Layers of equal size, one per network, whose parameters and statistics become slices of shared arrays."""
 
     def __init__(self, layers: Sequence[Any]) -> None:
         self._layers, self._settings = layers, layers[0]
         self._eps = np.float32(layers[0].eps)
         scales, biases = [layer.scale for layer in layers], [layer.bias for layer in layers]
-        self._scale, self._bias = (share(values).numpy()[:, None] for values in (scales, biases))
+        self.scale, self._bias = (share(values).numpy()[:, None] for values in (scales, biases))
         self._scale_gradient, self._bias_gradient = (share_gradients(values)[:, None] for values in (scales, biases))
         names = ("ra_mean", "ra_var")
         self._mean, self._var = (share([getattr(layer, name) for layer in layers]).numpy()[:, None] for name in names)
 
-    def normalize(self, inputs: Floats) -> _Normalized:
-        """Return how the running statistics normalize."""
-        factor: Floats = np.reciprocal(np.sqrt(self._var + self._eps))
-        return _Normalized(inputs, factor, -self._mean * factor)
+    def run(self, inputs: Floats, *, learns: bool) -> tuple[Floats, _Normalized]:
+        """Return the layers' outputs; with `learns` by the statistics of the batch, which change the running ones."""
+        if learns:
+            normalized = self._learn(inputs)
+        else:
+            factor: Floats = np.reciprocal(np.sqrt(self._var + self._eps))
+            normalized = _Normalized(inputs - self._mean, factor, np.zeros_like(factor))
+        outputs = normalized.centered * (normalized.factor * self.scale)
+        outputs += normalized.shift * self.scale + self._bias
+        return outputs, normalized
 
-    def learn(self, inputs: Floats) -> _Normalized:
-        """Return how the statistics of the batch normalize; they change the running ones."""
+    def _learn(self, inputs: Floats) -> _Normalized:
         settings, count = self._settings, inputs.shape[1]
         mean = _sum(inputs) / np.float32(count)
         centered = inputs - mean
-        var = np.einsum("nbi,nbi->ni", centered, centered)[:, None] / np.float32(count - 1)
+        var = _sum(np.square(centered)) / np.float32(count - 1)
         ratio, shift = np.ones_like(self._var), np.zeros_like(self._mean)
         if int(settings.steps) > settings.warmup_steps:
             running = np.sqrt(self._var + self._eps)
@@ -74,47 +72,21 @@ class _Renorm:
         by_var = np.divide(-0.5 * shift, ratio * deviation, out=np.zeros_like(factor), where=deviation > 0)
         return _Normalized(centered, factor, away * factor, 1 / np.square(ratio), by_var)
 
-    def fold(self, normalized: _Normalized, weights: Floats, biases: Floats) -> tuple[Floats, Floats]:
-        """Return the weights and biases of the linear layer for inputs that are not normalized."""
-        constant = normalized.shift * self._scale + self._bias
-        return self.scale(normalized, weights), biases + constant @ weights.swapaxes(1, 2)
-
-    def apply(self, normalized: _Normalized) -> Floats:
-        """Return the outputs."""
-        outputs = self.scale(normalized, normalized.inputs)
-        outputs += normalized.shift * self._scale + self._bias
-        return outputs
-
-    def scale(self, normalized: _Normalized, values: Floats) -> Floats:
-        """Return weights, or gradients, of the outputs as those of the inputs."""
-        return values * (normalized.factor * self._scale)
-
-    def backpropagate(
-        self, normalized: _Normalized, weights: Floats, gradients: Sequence[Floats], latent: Floats | None
-    ) -> tuple[Floats, Floats]:
-        """Turn gradients of the folded weights and biases into those of all parameters, and of two factors.
-
-        The gradient of the layer's inputs is the one by the folded weights, plus the returned slope times
-        `normalized.inputs`, plus the returned constant. `latent` is a gradient of the normalized inputs that did not
-        come through the weights.
-        """
-        to_folded, to_biases = gradients
-        total, product = to_biases @ weights, np.einsum("noi,noi->ni", weights, to_folded)[:, None]
-        if latent is not None:
-            total += _sum(latent)
-            product += _sum(latent * normalized.inputs)
-        factor = normalized.factor * self._scale
-        to_folded *= factor
-        to_folded += to_biases.swapaxes(1, 2) * (normalized.shift * self._scale + self._bias)
+    def backpropagate(self, normalized: _Normalized, gradient: Floats) -> Floats:
+        """Set the gradients of scale and bias from the outputs' gradient; return that of the inputs."""
+        total, product = _sum(gradient), _sum(gradient * normalized.centered)
         self._bias_gradient[...] = total
         self._scale_gradient[...] = product * normalized.factor + total * normalized.shift
-        assert normalized.var_by_var is not None
-        assert normalized.mean_by_var is not None
-        count = np.float32(normalized.inputs.shape[1])
-        to_mean = -factor * total
-        to_var = np.square(normalized.factor) * self._scale * self._scale_gradient * -0.5 * normalized.var_by_var
-        to_var += to_mean * normalized.mean_by_var
-        return to_var * (2 / (count - 1)), to_mean / count
+        factor = normalized.factor * self.scale
+        to_inputs: Floats = gradient * factor
+        if normalized.var_by_var is not None and normalized.mean_by_var is not None:
+            count = np.float32(gradient.shape[1])
+            to_mean = -factor * total
+            to_var = np.square(normalized.factor) * self.scale * self._scale_gradient * -0.5 * normalized.var_by_var
+            to_var += to_mean * normalized.mean_by_var
+            to_inputs += normalized.centered * (to_var * (2 / (count - 1)))
+            to_inputs += to_mean / count
+        return to_inputs
 
 
 def _sum(values: Floats) -> Floats:
@@ -123,7 +95,7 @@ def _sum(values: Floats) -> Floats:
 
 
 class _Passed(list[Floats]):
-    """The inputs and the output of each layer."""
+    """The inputs, then for each layer its normalized inputs and its output."""
 
     def __init__(self, inputs: Floats) -> None:
         super().__init__([inputs])
@@ -144,27 +116,20 @@ def is_supported(modules: Iterable[nn.Module]) -> bool:
 class NormalizedMlpStack(MlpStack):
     """As `MlpStack`; a run for the use "learning" normalizes by the batch, all others by the running statistics."""
 
-    def __init__(self, stack: MlpStack, networks: Sequence[Iterable[nn.Module]], *, keeps_latent: bool = False) -> None:
-        """Use the linear layers of `stack`, and the batch normalization in the modules of `networks`.
-
-        `keeps_latent`: whether `run` returns the last layer's normalized inputs too.
-        """
+    def __init__(self, stack: MlpStack, networks: Sequence[Iterable[nn.Module]]) -> None:
+        """Use the linear layers of `stack`, and the batch normalization in the modules of `networks`."""
         vars(self).update(vars(stack))
-        self._keeps_latent = keeps_latent
         norms = [[module for module in network if isinstance(module, BatchRenorm1d)] for network in networks]
         self._norms = [_Renorm(row) for row in zip(*norms, strict=True)]
 
     def run(self, inputs: Floats, use: str) -> list[Floats]:
-        """Return the inputs and the output of each layer; if it is kept, the latent state is the last but one."""
+        """Return the inputs, and for each layer its normalized inputs and its output."""
         values = _Passed(inputs)
         outputs = self._get_buffers(use, inputs.shape[1])
         for index, norm in enumerate(self._norms):
-            normalized = norm.learn(values[index]) if use == "learning" else norm.normalize(values[index])
-            if self._keeps_latent and index + 1 == len(self._norms):
-                values.append(norm.apply(normalized))
-            weights, biases = norm.fold(normalized, self._weights[index], self._biases[index])
-            self._run_layer(index, normalized.inputs, outputs[index], weights, biases)
-            values.append(outputs[index])
+            inputs, normalized = norm.run(values[-1], learns=use == "learning")
+            self._run_layer(index, inputs, outputs[index])
+            values += [inputs, outputs[index]]
             values.normalized.append(normalized)
         return values
 
@@ -173,29 +138,23 @@ class NormalizedMlpStack(MlpStack):
     ) -> None:
         """As `MlpStack.backpropagate`; `latent` is the gradient of the last layer's normalized inputs."""
         assert isinstance(values, _Passed)
-        hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(len(self._weights))):
-            normalized, weights, norm = values.normalized[index], self._weights[index], self._norms[index]
-            parts = gradients[2 * index : 2 * index + 2]
-            self._set_gradients(normalized.inputs, gradient, parts)
-            slope, constant = norm.backpropagate(normalized, weights, parts, latent)
+            self._set_gradients(values[2 * index + 1], gradient, gradients[2 * index : 2 * index + 2])
+            gradient = gradient @ self._weights[index]
+            if latent is not None:
+                gradient += latent
+                latent = None
+            gradient = self._norms[index].backpropagate(values.normalized[index], gradient)
             if index > 0:
-                gradient = np.matmul(gradient, norm.scale(normalized, weights), out=hidden[index - 1])
-                if latent is not None:
-                    gradient += norm.scale(normalized, latent)
-                by_statistics = normalized.inputs  # no longer needed, and overwritten
-                by_statistics *= slope
-                by_statistics += constant
-                gradient += by_statistics
-                self._derive(gradient, values[index])
-            latent = None
+                self._derive(gradient, values[2 * index])
 
     def input_gradient(self, values: list[Floats], gradient: Floats, first: int) -> Floats:
         """Return the gradient of inputs `first` and later, of a run by the running statistics."""
         assert isinstance(values, _Passed)
         for index in reversed(range(len(self._weights))):
             begin = 0 if index else first
-            gradient = gradient @ self._norms[index].scale(values.normalized[index], self._weights[index])[:, :, begin:]
+            gradient = gradient @ self._weights[index][:, :, begin:]
+            gradient *= (values.normalized[index].factor * self._norms[index].scale)[:, :, begin:]
             if index > 0:
-                self._derive(gradient, values[index])
+                self._derive(gradient, values[2 * index])
         return gradient

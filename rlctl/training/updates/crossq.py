@@ -64,8 +64,7 @@ class CrossQGradients(SacGradients):
     def normalize(self, actor: Sequence[Any], critics: Sequence[Sequence[Any]]) -> None:
         """Use the batch normalization in these modules."""
         if is_normalized(actor):
-            uses_gsde = self._settings.log_std is not None
-            self._actor.network = NormalizedMlpStack(self._actor.network, [actor], keeps_latent=uses_gsde)
+            self._actor.network = NormalizedMlpStack(self._actor.network, [actor])
         if is_normalized(critics[0]):
             stacks = [NormalizedMlpStack(self._critics.select(index), [net]) for index, net in enumerate(critics)]
             weights = sum(math.prod(shape) for shape in list_shapes(self._settings.critic))
