@@ -171,10 +171,13 @@ def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
         lines.append(f"{', '.join(still)} cannot move it, and could be left out of JOINTS")
     if others:
         lines.append(f"START of {', '.join(others)} is kept")
-    if arm.keyframe:
-        lines.append(f"START is the keyframe {arm.keyframe!r} of the file")
+    start = f"the keyframe {arm.keyframe!r} of the file" if arm.keyframe else "a guess"
+    lines.append(f"START is {start}{_explain_keyframe(arm.body)}")
     if unused := _list_unused(arm.path):
-        lines.append(f"Not used of the file: {', '.join(unused)}; the task's act() drives the joints (docs/mujoco.md)")
+        lines.append(
+            f"Not used of the file: {', '.join(unused)}; the task's act() drives the joints by drive_to. "
+            "set_controls would use its actuators"
+        )
     if arm.height:
         lines.append(f"It is {arm.height:g} m above the floor, into which it hangs otherwise")
     if only_mujoco:
@@ -316,11 +319,27 @@ def _read_keyframe(body: MujocoBody) -> tuple[str, list[Any]]:
     from rlctl.task.mujoco.robot import read_keyframe
 
     name, keyed = read_keyframe(body.file, body.joint_names)
-    if not set(body.joint_names) <= set(keyed):
+    if not set(body.joint_names) <= set(keyed) or _list_outside(body, keyed):
         return "", []
-    pose = np.array([keyed[joint] for joint in body.joint_names])
-    is_inside = bool(((body.joint_low <= pose) & (pose <= body.joint_high)).all())
-    return (name, [pose]) if is_inside else ("", [])
+    return name, [np.array([keyed[joint] for joint in body.joint_names])]
+
+
+def _list_outside(body: MujocoBody, keyed: Mapping[str, float]) -> list[str]:
+    """Return the joints whose positions in a keyframe are outside their limits."""
+    limits = zip(body.joint_names, body.joint_low, body.joint_high, strict=True)
+    return [name for name, low, high in limits if name in keyed and not low <= keyed[name] <= high]
+
+
+def _explain_keyframe(body: MujocoBody) -> str:
+    """Return why the keyframe of an MJCF file is not the start, if that is because of the limits."""
+    from rlctl.task.mujoco.robot import read_keyframe
+
+    name, keyed = read_keyframe(body.file, body.joint_names)
+    outside = _list_outside(body, keyed)
+    if not outside:
+        return ""
+    first = f"{outside[0]} at {keyed[outside[0]]:g}"
+    return f": the keyframe {name!r} has {first}, outside its limits (a keyframe is in radians)"
 
 
 def _limit_speeds(body: MujocoBody) -> tuple[list[float], str]:

@@ -151,7 +151,7 @@ def test_sites_and_keyframe_of_an_mjcf_file_are_used(name, asked, tip, point, tm
     lines = plugin.summary.split(".\n")
     assert f"lift, wrist of arm.xml bring {tip} to a goal" in lines
     assert "START is the keyframe 'home' of the file" in lines
-    assert "Not used of the file: actuators; the task's act() drives the joints (docs/mujoco.md)" in lines
+    assert "Not used of the file: actuators; the task's act() drives the joints by drive_to" in plugin.summary
     with contextlib.closing(EnvSpec(plugin.target, sim=MUJOCO).make()) as env:
         env.reset(seed=0)
         task = env.unwrapped.task
@@ -160,6 +160,15 @@ def test_sites_and_keyframe_of_an_mjcf_file_are_used(name, asked, tip, point, tm
         task.arm.set_joints(np.zeros(2))
         assert task.find_tip() == pytest.approx(np.array([0.0, 0.0, 0.3]) + point)
     assert "Attach conflict" not in capfd.readouterr().err  # MuJoCo warns of <size> and <visual>
+
+
+def test_a_keyframe_outside_the_limits_is_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.xml").write_text(SITES.replace('qpos="0.5 -0.25"', 'qpos="30 -15"'))
+    summary = new.create("keyed-arm", model="arm.xml").summary
+    assert (
+        "START is a guess: the keyframe 'home' has lift at 30, outside its limits (a keyframe is in radians)" in summary
+    )
 
 
 def test_a_link_that_its_own_joint_only_turns_is_held_at_its_end(tmp_path, monkeypatch):
