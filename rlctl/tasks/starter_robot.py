@@ -27,6 +27,7 @@ _GUESSED_DAMPING, _GUESSED_ARMATURE = 0.03, 0.01  # [s], of the stiffness; [kg m
 _LOWEST_TIP = 0.03  # [m], above the floor, at the start
 _IN_FLOOR = 1e-3  # [m]
 _TRIES = 300
+_GUESS = "a guess"  # where a start is from
 _FLOOR = SourceText('        sim.load("floor", "plane.urdf", fixed=True)\n')
 
 
@@ -99,7 +100,7 @@ class _Arm:
     joints: list[str]  # that move the tip
     start: Any  # positions of all joints
     height: float  # [m], of the base above where the file has it
-    keyframe: str  # whose pose `start` is; empty if it was searched
+    origin: str  # of `start`: a keyframe, or a guess
     motors: AskedMotors | None
 
 
@@ -123,8 +124,8 @@ def read_robot(model: str, link: str | None, motors: AskedMotors | None = None) 
     arm = ArmModel(body)
     tip = _find_tip(arm, link)
     joints = [body.joint_names[joint] for joint in arm.list_joints_to(tip.link)]
-    start, height, keyframe = _find_start(arm, tip)
-    described = _Arm(body, path, arm, tip, joints, start, height, keyframe, motors)
+    start, height, origin = _find_start(arm, tip)
+    described = _Arm(body, path, arm, tip, joints, start, height, origin, motors)
     only_mujoco = motors is None and not reads_in_pybullet(path, body.joint_names)
     kept = {
         "point" if tip.point is not None else "origin": True,
@@ -171,8 +172,7 @@ def _summarize(arm: _Arm, *, only_mujoco: bool) -> str:
         lines.append(f"{', '.join(still)} cannot move it, and could be left out of JOINTS")
     if others:
         lines.append(f"START of {', '.join(others)} is kept")
-    start = f"the keyframe {arm.keyframe!r} of the file" if arm.keyframe else "a guess"
-    lines.append(f"START is {start}{_explain_keyframe(arm.body)}")
+    lines.append(f"START is {arm.origin}")
     if unused := _list_unused(arm.path):
         lines.append(
             f"Not used of the file: {', '.join(unused)}; the task's act() drives the joints by drive_to. "
@@ -288,7 +288,7 @@ def name_robot(model: Path) -> str:
 
 
 def _find_start(arm: ArmModel, tip: Tip) -> tuple[Any, float, str]:
-    """Return joint positions inside their limits, how far the base must be raised [m], and a keyframe's name.
+    """Return joint positions inside their limits, how far the base must be raised [m], and where they are from.
 
     They are those of an MJCF file's keyframe, or near 0, or else any: the tip is above the floor, and no link that
     moves is in it. If there are no such positions the base is raised by how far down the robot gets.
@@ -297,7 +297,7 @@ def _find_start(arm: ArmModel, tip: Tip) -> tuple[Any, float, str]:
 
     low, high = arm.find_range()
     rng = np.random.default_rng(0)
-    keyframe, keyed = _read_keyframe(arm.body)
+    keyed, origin = _read_keyframe(arm.body)
     poses = [*keyed, np.clip(0.0, low, high), (low + high) / 2, *(rng.uniform(low, high) for _ in range(_TRIES))]
     shapes, has_plane, lowest = arm.list_moving_shapes(), arm.has_plane(), 0.0
     for number, pose in enumerate(poses):
@@ -305,41 +305,33 @@ def _find_start(arm: ArmModel, tip: Tip) -> tuple[Any, float, str]:
         arm.body.set_joints(pose)
         tip_height, lowest_shape = float(arm.locate(tip)[2]), arm.find_lowest(shapes)
         if tip_height > _LOWEST_TIP and (has_plane or lowest_shape > -_IN_FLOOR):
-            return pose, 0.0, keyframe if number < len(keyed) else ""
+            is_other = number >= len(keyed) > 0
+            return pose, 0.0, _GUESS if is_other else origin
         lowest = min(lowest, tip_height, lowest_shape)
     if has_plane:
         raise UsageError(f"{arm.body.file.name}: {tip.link!r} is never above the floor, z = 0; choose another --link")
-    return np.round(poses[0], 3) + 0.0, math.ceil(100 * (_LOWEST_TIP - lowest)) / 100, keyframe if keyed else ""
+    return np.round(poses[0], 3) + 0.0, math.ceil(100 * (_LOWEST_TIP - lowest)) / 100, origin
 
 
-def _read_keyframe(body: MujocoBody) -> tuple[str, list[Any]]:
-    """Return the name of an MJCF file's keyframe and the joint positions, if they are inside the limits."""
+def _read_keyframe(body: MujocoBody) -> tuple[list[Any], str]:
+    """Return the joint positions of an MJCF file's keyframe and its name, for people.
+
+    Without usable ones the list is empty, and the text says why if they are outside the limits.
+    """
     import numpy as np
 
     from rlctl.task.mujoco.robot import read_keyframe
 
     name, keyed = read_keyframe(body.file, body.joint_names)
-    if not set(body.joint_names) <= set(keyed) or _list_outside(body, keyed):
-        return "", []
-    return name, [np.array([keyed[joint] for joint in body.joint_names])]
-
-
-def _list_outside(body: MujocoBody, keyed: Mapping[str, float]) -> list[str]:
-    """Return the joints whose positions in a keyframe are outside their limits."""
     limits = zip(body.joint_names, body.joint_low, body.joint_high, strict=True)
-    return [name for name, low, high in limits if name in keyed and not low <= keyed[name] <= high]
-
-
-def _explain_keyframe(body: MujocoBody) -> str:
-    """Return why the keyframe of an MJCF file is not the start, if that is because of the limits."""
-    from rlctl.task.mujoco.robot import read_keyframe
-
-    name, keyed = read_keyframe(body.file, body.joint_names)
-    outside = _list_outside(body, keyed)
-    if not outside:
-        return ""
-    first = f"{outside[0]} at {keyed[outside[0]]:g}"
-    return f": the keyframe {name!r} has {first}, outside its limits (a keyframe is in radians)"
+    outside = [joint for joint, low, high in limits if joint in keyed and not low <= keyed[joint] <= high]
+    if outside:
+        first = f"{outside[0]} at {keyed[outside[0]]:g}"
+        fault = f"the keyframe {name!r} has {first}, outside its limits (a keyframe is in radians)"
+        return [], f"{_GUESS}: {fault}"
+    if not set(body.joint_names) <= set(keyed):
+        return [], _GUESS
+    return [np.array([keyed[joint] for joint in body.joint_names])], f"the keyframe {name!r} of the file"
 
 
 def _limit_speeds(body: MujocoBody) -> tuple[list[float], str]:
