@@ -40,6 +40,8 @@ _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM
 _MARK = "RLCTL_CHILD_PROCESSES"
 """Variable with the identifiers of the children in which a process runs; its own children inherit it."""
 _MOST_ROUNDS = 5  # what is killed may have started others in the meantime
+_EXEC_S = 0.02  # [s]
+"""A process that has just been started has its environment after that time."""
 start_process: Callable[..., "subprocess.Popen[bytes]"] = subprocess.Popen
 """Starts a child. Tests start many: they replace it by a function that forks a prepared process."""
 
@@ -144,21 +146,27 @@ class Standstill:
 def _kill_marked(identifier: str) -> None:
     """Kill the processes that a child has started in sessions of their own, where the system lists processes."""
     for _ in range(_MOST_ROUNDS):
-        marked = _find_marked(identifier)
-        if not marked:
-            return
+        marked, starting = _find_marked(identifier)
         for pid in marked:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, signal.SIGKILL)
+        if not marked:
+            if not starting:
+                return
+            time.sleep(_EXEC_S)
 
 
-def _find_marked(identifier: str) -> list[int]:
-    found = []
+def _find_marked(identifier: str) -> tuple[list[int], bool]:
+    """Return the processes with an identifier, and whether one is starting, whose environment cannot be seen yet."""
+    found, starting = [], False
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has ended, or is another user's
-            if identifier.encode() in (folder / "environ").read_bytes():
+            environment = (folder / "environ").read_bytes()
+            if identifier.encode() in environment:
                 found.append(int(folder.name))
-    return found
+            elif not environment:
+                starting |= bool(os.readlink(folder / "exe"))  # raises for what is no program, such as a zombie
+    return found, starting
 
 
 def run_main(job: dict[str, Any]) -> None:
