@@ -64,6 +64,7 @@ def gate(
     from rlctl.evaluation.eval_request import EvalRequest, Gates
     from rlctl.gating.gate import GateRequest, run_gate
     from rlctl.gating.report import show, show_step
+    from rlctl.runs.compare.comparison import ComparisonGate
 
     if no_check:
         for name, value in (("--strict", strict), ("--budget", budget), ("--sarif", sarif)):
@@ -82,8 +83,7 @@ def gate(
         evaluation=evaluation,
         gates=Gates(min_success, min_success_lower, min_return),
         against=against,
-        margin=margin,
-        allow_no_success=allow_no_success,
+        comparison=ComparisonGate(margin, allow_no_success=allow_no_success),
         export=export,
         strict=strict,
         budget_s=budget,

@@ -167,8 +167,8 @@ def compare_runs(
 ) -> None:
     """Test whether a policy, or a recipe trained with several seeds, is better than another."""
     from rlctl.evaluation.eval_request import EvalRequest
-    from rlctl.runs.compare.comparison import compare
-    from rlctl.runs.compare.report import BETTER, make_suite, show
+    from rlctl.runs.compare.comparison import ComparisonGate, compare
+    from rlctl.runs.compare.report import make_suite, show
     from rlctl.storage.junit import write as write_junit
 
     began = time.monotonic()
@@ -181,25 +181,16 @@ def compare_runs(
         return
     if picture is not None:
         raise UsageError("--picture draws maps: add --vary, or draw learning curves: rlctl runs report --format png")
-    is_better = gate == BETTER
+    is_better = gate == "better"
     if is_better and margin is not None:
         raise UsageError("--gate better and --margin exclude each other: a margin is of --gate not-worse")
     result = compare(runs, request, threshold, force=force, margin=margin)
-    show(result, json, gate, margin, allow_no_success=allow_no_success)
-    has_gate = gate is not None or margin is not None
+    asked = ComparisonGate(margin, is_better, allow_no_success) if gate or margin is not None else None
+    show(result, json, asked)
     if junit is not None:
-        seconds = time.monotonic() - began
-        suite = make_suite(
-            result,
-            seconds,
-            has_gate=has_gate,
-            margin=margin,
-            allow_no_success=allow_no_success,
-            better=is_better,
-        )
-        write_junit(junit, [suite])
-    if has_gate:
-        result.check(margin, allow_no_success=allow_no_success, better=is_better)
+        write_junit(junit, [make_suite(result, asked, time.monotonic() - began)])
+    if asked:
+        result.check(asked)
 
 
 def _compare_maps(

@@ -18,7 +18,7 @@ from rlctl.evaluation.players import find_player
 from rlctl.exporting.export import ExportReport, export_policy
 from rlctl.exporting.export_request import ExportRequest, Format
 from rlctl.runs import lookup
-from rlctl.runs.compare.comparison import RunComparison, compare
+from rlctl.runs.compare.comparison import NOT_WORSE, ComparisonGate, RunComparison, compare
 from rlctl.runs.compare.significance import Verdict
 from rlctl.storage import junit
 from rlctl.storage.junit import Case, Suite
@@ -32,8 +32,7 @@ class GateRequest:
     gates: Gates
     against: Path | None = None
     """The policy in use, which the new one must not be worse than; None: nothing is compared."""
-    margin: float | None = None  # loss of success that the episodes must exclude; None: a significant loss fails
-    allow_no_success: bool = False  # whether two policies that never succeed pass the comparison
+    comparison: ComparisonGate = NOT_WORSE  # what it must show against that one
     export: Path | None = None  # file to write, .onnx or .c; None: nothing is exported
     strict: bool = False  # whether warnings of the check fail
     budget_s: float | None = None  # of each process of the check; None: as much as `check-env` takes
@@ -45,7 +44,7 @@ class GateRequest:
                 "gate: say what the policy must reach, e.g. --min-success-lower 0.9, or --min-return 100; "
                 "or which policy it must not be worse than: --against FILE"
             )
-        if self.margin is not None and self.against is None:
+        if self.comparison.margin is not None and self.against is None:
             raise UsageError("--margin: with what is it compared? Add --against FILE.safetensors")
         if self.export is not None and self.export.suffix not in (".onnx", ".c"):
             raise UsageError(f"--export {self.export}: give a name that ends in .onnx or .c")
@@ -229,9 +228,9 @@ class _Findings:
             None, task=options.task, episodes=options.episodes, seed=options.seed, changes=options.changes
         )
         texts = [str(request.against), str(self._source.file)]
-        self.comparison = result = compare(texts, others, margin=request.margin)
+        self.comparison = result = compare(texts, others, margin=request.comparison.margin)
         self._show(result)
-        missed = result.list_missed(request.margin, allow_no_success=request.allow_no_success)
+        missed = list(result.find_missed(request.comparison).values())
         verdict = result.candidates[0].verdict
         summary = f"{verdict} than {request.against}"
         if verdict is Verdict.CANNOT_TELL:

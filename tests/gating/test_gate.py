@@ -12,6 +12,7 @@ from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.evaluate import run_evaluation
 from rlctl.gating.gate import GateReport, GateRequest, GateStep, Result
 from rlctl.gating.report import as_json, to_markdown
+from rlctl.runs.compare.comparison import ComparisonGate
 from rlctl.storage import junit
 from tests.evaluation.conftest import block_run  # noqa: F401 - a fixture
 
@@ -67,7 +68,7 @@ def test_markdown_has_a_row_for_each_step():
     ("options", "message"),
     [
         ({"gates": NO_GATES}, r"^gate: say what the policy must reach, e\.g\. --min-success-lower 0\.9"),
-        ({"margin": 0.05}, r"^--margin: with what is it compared\? Add --against"),
+        ({"comparison": ComparisonGate(margin=0.05)}, r"^--margin: with what is it compared\? Add --against"),
         ({"export": Path("policy.txt")}, r"^--export policy\.txt: give a name that ends in \.onnx or \.c$"),
     ],
 )

@@ -15,7 +15,7 @@ from rlctl.evaluation.players import choose_spec, load_player
 from rlctl.launching.train import run_training
 from rlctl.recipe.recipe import find_difference
 from rlctl.recipe.sources import resolve
-from rlctl.runs.compare.comparison import Candidate, RunComparison, Side, compare
+from rlctl.runs.compare.comparison import NOT_WORSE, Candidate, ComparisonGate, RunComparison, Side, compare
 from rlctl.runs.compare.margin import check_margin
 from rlctl.runs.compare.report import as_json, describe_candidate, describe_seeds, format_needed, make_suite
 from rlctl.runs.compare.significance import MeanDifference, Verdict
@@ -169,9 +169,9 @@ def test_a_margin_must_be_excluded(root):
     tied = dataclasses.replace(difference, low=-0.2, high=0.1, p=1.0)
     candidate = dataclasses.replace(result.candidates[0], differences={"success": tied})
     result = dataclasses.replace(result, candidates=[candidate])
-    result.check(margin=0.2)
+    result.check(ComparisonGate(margin=0.2))
     with pytest.raises(AnswerIsNo, match=r"its success may be lower by as much as 0\.2; --margin allows 0\.1$"):
-        result.check(margin=0.1)
+        result.check(ComparisonGate(margin=0.1))
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_a_copy_of_a_policy_passes_any_margin(root, tmp_path):
     one, _ = sorted((root / "0.9/Line").iterdir())
     copy = shutil.copy(one / "policies/best.safetensors", tmp_path / "copy.safetensors")
     result = compare([str(one), str(copy)], EvalRequest(None, episodes=4), margin=0.05)
-    result.check(margin=0.05)
+    result.check(ComparisonGate(margin=0.05))
     assert describe_candidate(result, result.candidates[0])[0].startswith("the same policy file (sha256 ")
     assert result.candidates[0].side.runs[0].evaluation is result.baseline.runs[0].evaluation
 
@@ -233,7 +233,7 @@ def test_the_gate_better(root, success, of_return, is_better):
     changed = dataclasses.replace(result.candidates[0], differences=differences)
     result = dataclasses.replace(result, candidates=[changed])
     missed = [] if is_better else [f"{two}: not shown to be better than {one}"]
-    assert result.list_missed(better=True) == missed
+    assert list(result.find_missed(ComparisonGate(better=True)).values()) == missed
 
 
 def test_gate(root):
@@ -270,10 +270,10 @@ def test_two_policies_that_never_succeed_pass_no_gate_unless_told_to(root):
     result = never_succeeding(compare([str(one), str(two)], EvalRequest(None, episodes=4)))
     for margin in (None, 1.0):
         with pytest.raises(AnswerIsNo, match=r"both succeed in none of 4 episodes.*--allow-no-success lets that pass$"):
-            result.check(margin)
-    (name,) = result.find_missed(1.0)
+            result.check(ComparisonGate(margin))
+    (name,) = result.find_missed(ComparisonGate(margin=1.0))
     assert name == str(two)
-    assert "both succeed" not in str(result.list_missed(allow_no_success=True))
+    assert "both succeed" not in str(result.find_missed(ComparisonGate(allow_no_success=True)))
     half = dataclasses.replace(result, candidates=[])
     half.check()
 
@@ -281,10 +281,10 @@ def test_two_policies_that_never_succeed_pass_no_gate_unless_told_to(root):
 def test_junit_has_a_case_for_each_candidate(root):
     one, two = sorted((root / "0.9/Line").iterdir())
     result = never_succeeding(compare([str(one), str(two)], EvalRequest(None, episodes=4)))
-    (case,) = make_suite(result, 1.5, has_gate=True).cases
+    (case,) = make_suite(result, NOT_WORSE, 1.5).cases
     assert case.name == f"{two} against {one}"
     assert [outcome.tag for outcome in case.outcomes] == ["failure"]
-    (case,) = make_suite(result, 1.5, has_gate=False).cases
+    (case,) = make_suite(result, None, 1.5).cases
     assert [outcome.tag for outcome in case.outcomes] == ["system-out"]
 
 

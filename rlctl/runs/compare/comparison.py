@@ -114,6 +114,25 @@ class Candidate:
 
 
 @dataclasses.dataclass(frozen=True)
+class ComparisonGate:
+    """What candidates must show against the baseline: not to be worse, unless it says otherwise."""
+
+    margin: float | None = None
+    """The episodes must exclude a larger loss of success, or of return if the task reports no success."""
+    better: bool = False  # each must be shown to be better, see `Candidate.is_better`
+    allow_no_success: bool = False
+    """Whether a candidate passes that never succeeds, as the baseline: it is not worse, but does nothing."""
+
+    @property
+    def name(self) -> str:
+        """As `--gate` takes it."""
+        return "better" if self.better else "not-worse"
+
+
+NOT_WORSE = ComparisonGate()
+
+
+@dataclasses.dataclass(frozen=True)
 class RunComparison:
     """The baseline and the candidates that were compared with it."""
 
@@ -135,44 +154,30 @@ class RunComparison:
         """The baseline, then the candidates' sides."""
         return [self.baseline, *(candidate.side for candidate in self.candidates)]
 
-    def list_missed(
-        self, margin: float | None = None, *, allow_no_success: bool = False, better: bool = False
-    ) -> list[str]:
-        """Return a phrase for each candidate that misses the gate, see `find_missed`."""
-        return list(self.find_missed(margin, allow_no_success=allow_no_success, better=better).values())
-
-    def find_missed(
-        self, margin: float | None = None, *, allow_no_success: bool = False, better: bool = False
-    ) -> dict[str, str]:
-        """Return the candidates that are worse than the baseline; with `margin`, that may be by more, with a phrase.
-
-        `margin` is a success rate, and only success counts then; or a return if the task reports no success. A
-        candidate with the same policy is neither. A candidate that never succeeds, as the baseline, is not worse but
-        does nothing; it misses the gate too, unless `allow_no_success`. With `better` all candidates miss the gate
-        that are not shown to be better, see `Candidate.is_better`.
-        """
+    def find_missed(self, gate: ComparisonGate = NOT_WORSE) -> dict[str, str]:
+        """Return the candidates that miss the gate, with a phrase; one with the baseline's policy is not worse."""
         missed = {}
         for candidate in self.candidates:
             name = candidate.side.name
-            if candidate.side.never_succeeds and self.baseline.never_succeeds and not allow_no_success:
+            if candidate.side.never_succeeds and self.baseline.never_succeeds and not gate.allow_no_success:
                 problem = (
                     f"not worse, but both succeed in none of {self.episodes} episodes, so nothing is shown; "
                     "--allow-no-success lets that pass"
                 )
-            elif better:
+            elif gate.better:
                 problem = "" if candidate.is_better else f"not shown to be better than {self.baseline.label}"
-            elif margin is None:
+            elif gate.margin is None:
                 problem = f"worse than {self.baseline.label}" if candidate.verdict is Verdict.WORSE else ""
             else:
-                problem = candidate.describe_loss(margin)
+                problem = candidate.describe_loss(gate.margin)
             if problem:
                 missed[name] = f"{candidate.side.label}: {problem}"
         return missed
 
-    def check(self, margin: float | None = None, *, allow_no_success: bool = False, better: bool = False) -> None:
-        """Raise `AnswerIsNo` for what `list_missed` returns."""
-        if missed := self.list_missed(margin, allow_no_success=allow_no_success, better=better):
-            raise AnswerIsNo(f"gate missed: {'; '.join(missed)}")
+    def check(self, gate: ComparisonGate = NOT_WORSE) -> None:
+        """Raise `AnswerIsNo` for what `find_missed` returns."""
+        if missed := self.find_missed(gate):
+            raise AnswerIsNo(f"gate missed: {'; '.join(missed.values())}")
 
 
 def compare(

@@ -9,26 +9,14 @@ from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.eval_request import judge
 from rlctl.recipe.stages import format_value
 from rlctl.runs.compare import significance
-from rlctl.runs.compare.comparison import Candidate, EvaluatedRun, RunComparison, Side
+from rlctl.runs.compare.comparison import Candidate, ComparisonGate, EvaluatedRun, RunComparison, Side
 from rlctl.storage.junit import Suite, make_gate_case
 from rlctl.version import collect_versions
 
-NOT_WORSE, BETTER = "not-worse", "better"  # the gates
 
-
-def make_suite(
-    result: RunComparison,
-    seconds: float,
-    *,
-    has_gate: bool,
-    margin: float | None = None,
-    allow_no_success: bool = False,
-    better: bool = False,
-) -> Suite:
+def make_suite(result: RunComparison, gate: ComparisonGate | None, seconds: float) -> Suite:
     """Return a test case for each candidate, which fails where it misses the gate; it took so long [s]."""
-    missed = {}
-    if has_gate:
-        missed = result.find_missed(margin, allow_no_success=allow_no_success, better=better)
+    missed = result.find_missed(gate) if gate else {}
     cases = []
     for candidate in result.candidates:
         name = candidate.side.name
@@ -39,21 +27,11 @@ def make_suite(
     return Suite(f"rlctl runs compare {result.task}", seconds, cases)
 
 
-def show(
-    result: RunComparison,
-    json: str | None,
-    gate: str | None = None,
-    margin: float | None = None,
-    *,
-    allow_no_success: bool = False,
-) -> None:
+def show(result: RunComparison, json: str | None, gate: ComparisonGate | None = None) -> None:
     """Print which question is answered, the scores, the differences and the verdicts; or JSON alone for `-`."""
-    has_gate = gate is not None or margin is not None
-    missed = []
-    if has_gate:
-        missed = result.list_missed(margin, allow_no_success=allow_no_success, better=gate == BETTER)
-    verdict = judge("runs compare", missed, has_gate=has_gate)
-    gates = {"gate": (gate or NOT_WORSE) if has_gate else None, "margin": margin}
+    missed = list(result.find_missed(gate).values()) if gate else []
+    verdict = judge("runs compare", missed, has_gate=gate is not None)
+    gates = {"gate": gate.name if gate else None, "margin": gate.margin if gate else None}
     if output.present(as_json(result) | verdict | gates, json):
         return
     out = output.out()
