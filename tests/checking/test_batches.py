@@ -21,7 +21,7 @@ CASES = [
         slow=True,
     ),
     case(f"{FILE}:RL407MovesAllBases", ("RL407", "error"), ("RL406", "warning"), twin=f"{FILE}:RL407MovesItsBase"),
-    case(f"{FILE}:RL408OneRow", ("RL408", "error"), twin=SOUND),
+    case(f"{FILE}:RL408OneRow", ("RL408", "error"), twin=SOUND, slow=True),
     case(f"{FILE}:RL408OneGoal", ("RL408", "error"), twin=SOUND),
     case(f"{FILE}:RL409CountsSteps", ("RL409", "error"), twin=f"{FILE}:RL409CountsStepsOfEach", slow=True),
     case(f"{FILE}:RL409KeepsLast", ("RL409", "error"), twin=SOUND),

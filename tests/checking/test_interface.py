@@ -11,7 +11,7 @@ from tests.checking.judging import case, check_case, findings, mark_slow, verdic
 
 FILE = "broken_interface.py"
 CASES = [
-    case(f"{FILE}:RL404NewSpaces", ("RL404", "warning")),
+    case(f"{FILE}:RL404NewSpaces", ("RL404", "warning"), slow=True),
     case(f"{FILE}:RL215TakesNoMode", ("RL215", "warning"), twin=f"{FILE}:Renders"),
     case(f"{FILE}:RL215RenderRaises", ("RL215", "warning"), twin=f"{FILE}:Renders"),
     case(f"{FILE}:RL215RenderNeedsGraphics", ("RL215", "info"), twin=f"{FILE}:Renders"),

@@ -13,7 +13,7 @@ def broken(name, twin, **settings):
 
 CASES = [
     broken("RL626GantryBridge", "broken_links.py:Gantry", slow=True),
-    broken("RL626ArmElbow", "mujoco_robots.py:MujocoArm"),
+    broken("RL626ArmElbow", "mujoco_robots.py:MujocoArm", slow=True),
     broken("RL626ReachElbow", "broken_reach.py:Arm", slow=True),
     broken("RL626ReacherElbow", "broken_reach_bullet.py:Reacher", pybullet=True, slow=True),
     broken("RL626CrankOtherLink", "broken_links.py:CrankPoints", pybullet=True, slow=True),

@@ -240,6 +240,7 @@ def test_command_shows_the_worst_first_with_numbers_and_fix():
     ]
 
 
+@pytest.mark.slow
 def test_command_of_mistakes_in_the_command():
     run = rlctl("CartPole-v99")
     assert run.returncode == 2

@@ -13,7 +13,7 @@ def broken(name, rule, severity, twin, **settings):
 CASES = [
     broken("RL114BoatHiddenBuoy", "RL114", "warning", "Boat"),
     broken("RL114TankHiddenWish", "RL114", "warning", "Tank"),
-    broken("RL115BoatOldObservation", "RL115", "error", "Boat"),
+    broken("RL115BoatOldObservation", "RL115", "error", "Boat", slow=True),
     broken("RL115ArmOldObservation", "RL115", "error", "Arm"),
     broken("RL116ArmQuaternion", "RL116", "error", "RL116ArmRightQuaternion", slow=True),
     broken("RL117BoatWraps", "RL117", "info", "Boat", slow=True),

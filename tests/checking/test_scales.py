@@ -24,7 +24,7 @@ CASES = [
     broken("RL706BulletArmOnePercent", "robots.py:Arm", "RL706", pybullet=True, slow=True),
     broken("RL706CrawlerOnePercent", "robots.py:Crawler", "RL706", pybullet=True, slow=True),
     broken("RL706PusherOnePercent", "robots.py:Pusher", "RL706", pybullet=True, slow=True),
-    broken("RL624RoverTolerance", "broken_meaning.py:Rover", "RL624"),
+    broken("RL624RoverTolerance", "broken_meaning.py:Rover", "RL624", slow=True),
     broken("RL624DroneTolerance", "broken_meaning.py:Drone", "RL624"),
     broken("RL624ArmTolerance", "mujoco_robots.py:MujocoArm", "RL624"),
     broken("RL624ReachTolerance", "broken_reach.py:Arm", "RL624"),

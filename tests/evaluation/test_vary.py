@@ -31,6 +31,7 @@ def measured(tmp_path_factory):
     return measure_robustness(request, ["push=0:3:3", "mass=1:3:2"])
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_a_cell_is_the_evaluation_with_its_values(block_run, measured):
     (found,) = measured.maps

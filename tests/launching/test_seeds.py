@@ -77,6 +77,7 @@ def test_each_seed_is_an_ordinary_run(group):
     assert content["return"]["mean"] == pytest.approx(sum(scores) / 2)
 
 
+@pytest.mark.slow
 def test_runs_of_a_group_are_found(group):
     root = group.path.parent.parent
     newest = find_run(LINE, root).path
@@ -91,6 +92,7 @@ def test_runs_of_a_group_are_found(group):
     assert find_policy(str(newest), root=root).notes == ()
 
 
+@pytest.mark.slow
 def test_the_newest_thing_trained_is_the_group(group, monkeypatch, tmp_path):
     root = group.path.parent.parent
     one = group.find_run(5).path
@@ -119,6 +121,7 @@ def test_resume_latest_goes_on_with_the_group(group, rlctl):
     assert [line.split()[0] for line in done.stdout.splitlines()[-5:-3]] == ["4", "5"]
 
 
+@pytest.mark.slow
 def test_a_group_that_is_being_trained_is_not_removed(group):
     with group.find_run(4).lock(), pytest.raises(UsageError, match="this run is being trained; nothing was removed"):
         plan_removal([str(group.path)], root=group.path.parent.parent)
@@ -182,6 +185,7 @@ def test_a_signal_stops_all_with_checkpoints(tmp_path):
         assert run.checkpoints()
 
 
+@pytest.mark.slow
 def test_a_group_that_is_being_trained_is_not_resumed(group):
     with RunLock(group.path, "group"), pytest.raises(UsageError, match=r"another process is writing this group \(pid"):
         train_seeds(TrainRequest(resume=str(group.path)), None)

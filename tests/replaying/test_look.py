@@ -191,6 +191,7 @@ def test_what_does_not_go_with_it(changes, message):
     assert str(caught.value).startswith(message)
 
 
+@pytest.mark.slow
 def test_the_folder_of_a_run_is_not_a_task(run):
     with pytest.raises(UsageError, match="is a run: leave out --policy, or name its task: rlctl replay TASK"):
         run_replay(ReplayRequest(str(run.run.path), baseline="zero"))

@@ -1,6 +1,7 @@
 """MJCF robots are drawn where PyBullet simulates them, and the camera goes along."""
 
 import dataclasses
+import functools
 from contextlib import closing
 from pathlib import Path
 
@@ -121,9 +122,12 @@ def test_thin_capsules_are_where_pybullet_has_them():
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory):
-    folder, made = tmp_path_factory.mktemp("mjcf"), {}
-    for name in ("ant", "humanoid", "hopper"):
+def recording(tmp_path_factory):
+    """The recording of a robot and its rollout, made when it is first asked for."""
+    folder = tmp_path_factory.mktemp("mjcf")
+
+    @functools.cache
+    def record(name):
         spec, warnings = EnvSpec(name, {}), []
         with closing(make_drawable(spec)) as env:
             env.action_space.seed(0)
@@ -132,17 +136,19 @@ def recordings(tmp_path_factory):
         path = folder / f"{name}.rrd"
         write_rrd(path, rollout, title=name, warn=warnings.append)
         assert warnings == []
-        made[name] = path, rollout
-    return made
+        return path, rollout
+
+    return record
 
 
 # ant.xml: a belly, and three capsules for each of four legs. humanoid_symmetric.xml: torso 3, waist, pelvis, thigh,
 # shin and foot twice, arms of 1 and 2 geoms twice. hopper.xml: torso, thigh, leg, foot.
+@pytest.mark.slow_except("ant-13")
 @pytest.mark.parametrize(
     ("name", "count"), [("ant", 1 + 4 * 3), ("humanoid", 3 + 1 + 1 + 2 * 3 + 2 * 3), ("hopper", 4)]
 )
-def test_every_geom_is_drawn_and_its_link_moves(recordings, name, count):
-    path, rollout = recordings[name]
+def test_every_geom_is_drawn_and_its_link_moves(recording, name, count):
+    path, rollout = recording(name)
     found = entities(path)
     assert len([entity for entity in found if entity.startswith("/world/robot/") and "/shape_" in entity]) == count
     robot = rollout.scene.robots()[0]
@@ -151,8 +157,8 @@ def test_every_geom_is_drawn_and_its_link_moves(recordings, name, count):
         np.testing.assert_allclose(positions[:, 0], robot.positions[:, robot.links.index(link)], atol=1e-5)
 
 
-def test_a_capsule_has_its_size_and_colour(recordings):
-    path, _ = recordings["ant"]
+def test_a_capsule_has_its_size_and_colour(recording):
+    path, _ = recording("ant")
     # <geom fromto="0 0 0 0.4 0.4 0" size="0.08" rgba=".8 .5 .3 1"/>: 0.4 * sqrt(2) long, around (0.2, 0.2, 0).
     foot = "/world/robot/front_left_foot/shape_0"
     assert static(path, foot, "Capsules3D:lengths") == pytest.approx([0.4 * 2**0.5])
@@ -164,18 +170,20 @@ def test_a_capsule_has_its_size_and_colour(recordings):
     assert static(path, other, "Capsules3D:colors")[0] >> 8 & 0xFF == 102
 
 
-def test_path_goes_through_the_torso_and_not_through_a_frame_outside_of_it(recordings):
+@pytest.mark.slow
+def test_path_goes_through_the_torso_and_not_through_a_frame_outside_of_it(recording):
     # hopper.xml puts all frames at the origin; the torso reaches from 1.05 to 1.45 m.
-    path, _ = recordings["hopper"]
+    path, _ = recording("hopper")
     _, strips = column(path, "/world/paths/robot", "LineStrips3D:strips")
     assert strips[0, 0, 0] == pytest.approx([0.0, 0.0, 1.25], abs=0.05)
 
 
+@pytest.mark.slow_except("ant-torso")
 @pytest.mark.parametrize(("name", "torso"), [("ant", "torso"), ("humanoid", "torso"), ("hopper", "torso")])
-def test_camera_follows_the_torso(recordings, name, torso):
-    (followed,) = tracked(recordings[name][0])
+def test_camera_follows_the_torso(recording, name, torso):
+    (followed,) = tracked(recording(name)[0])
     assert followed == f"/world/robot/{torso}/shape_0"
-    assert followed in entities(recordings[name][0])
+    assert followed in entities(recording(name)[0])
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ def root(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_policies_are_compared_episode_by_episode(root):
     one, two = sorted((root / "0.9/Line").iterdir())
     result = compare([str(one), str(two)], EvalRequest(None, episodes=5))

@@ -470,6 +470,7 @@ def test_difference_of_two_maps():
     assert b"two minus one" in plots.draw_differences(result, "svg")
 
 
+@pytest.mark.slow
 def test_many_maps_are_a_grid_with_room_for_their_numbers():
     scores = {"success_rate": 0.5, "success_interval": (0.4, 0.6), "mean_return": 1.0, "return_interval": (0.0, 2.0)}
     settings = {"events.mass.factor": 1.0, "events.noise.std": 0.002, "events.late.steps": 3.0, "task.tolerance": 0.05}

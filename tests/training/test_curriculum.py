@@ -67,6 +67,7 @@ def test_evaluation_is_always_in_the_last_stage(staged):
         assert (info.spec.stage, info.spec.parameters) == (2, HARD)
 
 
+@pytest.mark.slow
 def test_checkpoints_know_the_stage_and_addresses_go_on(staged):
     found = saved(staged.run)
     assert (found.state.progress.stage, found.state.progress.stage_began, found.state.progress.stage_episodes) == (

@@ -252,6 +252,7 @@ def test_arguments_are_checked_without_an_own_class():
         validate({"policy_kwargs": {"activation_fn": "sine"}}, "recipe")
 
 
+@pytest.mark.slow
 def test_a_hostile_graph_is_refused(trained, tmp_path):
     policy = PolicyFile.read(trained.run.last_policy)
     file = tmp_path / "policy.safetensors"

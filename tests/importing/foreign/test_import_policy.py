@@ -550,6 +550,7 @@ def test_the_command_names_what_it_needs(rlctl, tmp_path):
     assert result.stdout.startswith("policy.safetensors: 12 joints, from deployment of rlctl")
 
 
+@pytest.mark.slow
 def test_one_command_imports_and_plays(rlctl, tmp_path):
     write_torchscript(tmp_path / "policy.pt", [45, 8, 12])
     write_yaml(tmp_path / "deploy.yaml", describe_walk())

@@ -108,6 +108,7 @@ def test_hidden_values_are_found(identified):
     assert identified.error_after < 2 * ENCODER
 
 
+@pytest.mark.slow
 def test_values_are_written_as_a_model_and_for_set_motors(identified, tmp_path):
     paths = write_robot(identified, tmp_path / "out")
     model = mujoco.MjModel.from_xml_path(str(paths[0]))
@@ -319,6 +320,7 @@ def test_a_model_that_does_not_explain_the_log_has_no_values(recorded, write):
         identify_robot(str(ROBOT), write(positions=recorded[2] + noise), fit=["coulomb", "delay"], threads=1)
 
 
+@pytest.mark.slow
 def test_the_written_model_moves_as_the_robot_did(identified, recorded):
     robot, targets, positions = recorded
     model = mujoco.MjModel.from_xml_string(make_mjcf(identified))

@@ -35,6 +35,7 @@ def read_metadata(address):
         return json.load(answer)
 
 
+@pytest.mark.slow
 def test_signals(served):
     process, file, address = served
     assert read_metadata(address)["training_steps"] == 0
