@@ -39,7 +39,7 @@ _IN_TABLE = 1e-3  # [m]
 _CAMERA_AWAY, _CAMERA_HEIGHT, _CAMERA_TARGET = 0.8, 0.7, 0.1  # of the reach, from the middle of the area
 _WRIST_BEHIND, _WRIST_ASIDE = 0.1, 0.08  # [m], from the tip, of an arm of that reach
 _INCLINED = 0.1  # [rad]
-_STEPS = {"pick": 4_000_000, "place": 6_000_000, "push": 3_000_000}
+_STEPS = {"pick": 4_000_000, "place": 4_000_000, "push": 5_000_000}
 
 
 @dataclasses.dataclass(frozen=True)
