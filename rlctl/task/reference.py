@@ -67,7 +67,8 @@ class Reference:
         self.position = np.concatenate([clip.root_position for clip in clips])
         self.orientation = np.concatenate([align_signs(clip.root_orientation) for clip in clips])
         self.heading = find_heading(self.orientation)
-        self.velocity = self._differentiate(self.position)  # in the world
+        self._frame_velocity = self._differentiate(self.position)  # of the root's frame, in the world
+        self.velocity = self._frame_velocity
         self.angular_velocity = self._find_angular_velocity()  # in the world
         self.turning = rotate_inverse(self.orientation, self.angular_velocity)  # in the frame of the root
         self.gravity = rotate_inverse(self.orientation, _DOWN)
@@ -113,7 +114,8 @@ class Reference:
         one = np.zeros(1, np.int64)
         body.set_base(np.zeros((1, 3)), worlds=one)
         self.offset = -body.link_position(body.base_name)[0]
-        self.velocity = self.velocity + np.cross(self.angular_velocity, rotate(self.orientation, self.offset))
+        # From the frame's each time: all worlds of a process share a reference, and each of them calls this.
+        self.velocity = self._frame_velocity + np.cross(self.angular_velocity, rotate(self.orientation, self.offset))
         self.link_names = list(links)
         places, turns = np.zeros((len(self), len(links), 3)), np.zeros((len(self), len(links), 4))
         for row in (*range(len(self)), 0):

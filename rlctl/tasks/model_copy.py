@@ -123,15 +123,28 @@ def _add(sources: dict[Path, str], source: Path, model: Path) -> str:
 
 def remove_floor(files: dict[Path, bytes], model: Path) -> list[str]:
     """Remove shapes of the world, such as a floor, from the copy of an MJCF file; return a sentence if there were."""
+    if _remove(files, model, "worldbody", "geom"):
+        return [f"The copy of {model.name} has no floor, since the task loads one"]
+    return []
+
+
+def remove_sensors(files: dict[Path, bytes], model: Path) -> list[str]:
+    """Remove the sensors from the copy of an MJCF file; return a sentence if there were."""
+    if _remove(files, model, "sensor", "*"):
+        return [f"The copy of {model.name} has no sensors: the task reads none, and they take time in every step"]
+    return []
+
+
+def _remove(files: dict[Path, bytes], model: Path, section: str, kind: str) -> bool:
+    """Remove the elements of a kind in the sections of the copy of an MJCF file; return whether there were any."""
     if model.suffix != ".xml":
-        return []
+        return False
     root = ElementTree.fromstring(files[model])
-    removed = 0
-    for world in root.iterfind("worldbody"):
-        for geom in world.findall("geom"):
-            world.remove(geom)
-            removed += 1
-    if not removed:
-        return []
-    files[model] = ElementTree.tostring(root)
-    return [f"The copy of {model.name} has no floor, since the task loads one"]
+    removed = False
+    for parent in root.iterfind(section):
+        for element in parent.findall(kind):
+            parent.remove(element)
+            removed = True
+    if removed:
+        files[model] = ElementTree.tostring(root)
+    return removed

@@ -16,7 +16,7 @@ from rlctl.task.clip_options import ClipOptions
 from rlctl.task.motion import MotionClip, write_motion
 from rlctl.task.motion_files import RobotJoints, read_clip
 from rlctl.tasks.legged_robot import load_free
-from rlctl.tasks.model_copy import copy_model, remove_floor
+from rlctl.tasks.model_copy import copy_model, remove_floor, remove_sensors
 from rlctl.tasks.motion_faults import Heights, find_faults, find_shift, measure_heights
 from rlctl.tasks.scaling import GRAVITY
 from rlctl.tasks.source_text import SourceText, join_source, write_list, write_number, write_string
@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 TEMPLATE = Path(__file__).with_name("template_motion")
 """Templates of the files that differ from those of an arm."""
 _SUBSTEPS = 2  # per action, each of 10 ms
+_ITERATIONS = 4  # of the solver, as the bundled tasks have it
+_LITTLE_FRICTION = 0.05  # of a joint's torque limit: dry friction that its motor does not notice
 _LONGEST = 10.0  # [s], of an episode
 _ENDLESS_FORCE = 20.0  # of weight x height of the root
 _GUESSED = 0.35  # of weight x height of the root, for a joint that carries the robot
@@ -49,6 +51,20 @@ class _Follower:
     forces: Array  # [N m]
     are_guessed: NDArray[np.bool_]
     armature: Array
+    friction: Array  # [N m], dry friction of the joints in the model
+
+    @property
+    def kept_friction(self) -> Array:
+        """Dry friction of the joints in the task [N m]: 0 where the motor does not notice it.
+
+        Each joint with dry friction is a constraint that the solver iterates on in every step.
+        """
+        return np.where(self.friction <= _LITTLE_FRICTION * self.forces, 0.0, self.friction)
+
+    @property
+    def loses_friction(self) -> bool:
+        """Whether the task leaves out dry friction that the model has."""
+        return bool((self.kept_friction < self.friction).any())
 
     @property
     def size(self) -> float:
@@ -76,13 +92,18 @@ def read_motion_robot(model: str, motions: Sequence[str], options: ClipOptions) 
         raise UsageError(f"--motion: the root is {size:.3g} m above the ground on average; z must be upwards, in m")
     forces, are_guessed = _find_forces(body, clips[0], size)
     own = body._sim.model.dof_armature[body.parts.velocities].copy()
+    friction = body._sim.model.dof_frictionloss[body.parts.velocities].copy()
     armature = np.where(own > 0, own, np.array([float(f"{force / _MOTOR:.2g}") for force in forces]))
-    follower = _Follower(body, path, clips, _choose_links(body), forces, are_guessed, armature)
+    follower = _Follower(body, path, clips, _choose_links(body), forces, are_guessed, armature, friction)
     files = copy_model(path)
     notes += remove_floor(files, Path(path.name))
+    notes += remove_sensors(files, Path(path.name))
     files |= {Path(f"{clip.name}.csv"): write_motion(clip) for clip in clips}
-    kept = frozenset({"many" if len(clips) > 1 else "one"})
-    return StarterRobot(_describe(follower), files, _summarize(follower, notes), template=TEMPLATE, kept=kept)
+    kept = {"many" if len(clips) > 1 else "one"}
+    if follower.loses_friction:
+        kept.add("friction")
+    summary = _summarize(follower, notes)
+    return StarterRobot(_describe(follower), files, summary, template=TEMPLATE, kept=frozenset(kept))
 
 
 def _put_on_floor(body: MujocoBody, clip: MotionClip) -> tuple[MotionClip, list[str]]:
@@ -203,6 +224,12 @@ def _summarize(follower: _Follower, notes: Sequence[str]) -> str:
         names = [name for name, guess in zip(body.joint_names, follower.are_guessed, strict=True) if guess]
         shown = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
         more.append(f"The model has no useful torque limits for {shown}: write those of your motors into MAX_FORCE")
+    if follower.loses_friction:
+        lost = follower.friction[follower.kept_friction < follower.friction].max()
+        more.append(
+            f"The task leaves out dry friction of the joints, up to {lost:.2g} N m: their motors do not notice it, and "
+            "it takes a quarter of the time of the physics. See FRICTION in task.py"
+        )
     return ".\n".join([first, *notes, *more, "Comments with CHANGE in task.py mark what to adapt"])
 
 
@@ -222,10 +249,18 @@ def _describe(follower: _Follower) -> dict[str, str]:
         "force_comment": guessed,
         "armature": write_list("ARMATURE = np.array(", map(write_number, follower.armature), ")"),
         "armature_comment": SourceText(),
+        "friction": _write_friction(follower.kept_friction),
         "farthest": write_number(_FARTHEST * size, ".2g"),
         "episode_s": write_number(min(_LONGEST, math.ceil(10 * longest) / 10), "g"),
         "substeps": str(_SUBSTEPS),
+        "iterations": str(_ITERATIONS),
         "push": write_number(_PUSH * math.sqrt(GRAVITY * size), ".2g"),
         "total_timesteps": "6_000_000",
         "links_in_readme": SourceText(join_source(map(write_string, follower.links))),
     }
+
+
+def _write_friction(friction: Array) -> SourceText:
+    if not friction.any():
+        return write_number(0.0)
+    return SourceText(f"np.array({write_list('FRICTION = np.array(', map(write_number, friction), ')')})")

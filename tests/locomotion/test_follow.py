@@ -59,6 +59,14 @@ def test_starts_are_in_the_clip(name):
         assert env.unwrapped.task.rows.tolist() == [0]
 
 
+def test_further_worlds_of_a_process_change_no_velocity_of_the_clip():
+    velocities = []
+    for _ in range(2):
+        with contextlib.closing(EnvSpec(TASKS["humanoid-bow"][0]).make()):
+            velocities.append(HumanoidBow.reference.velocity.copy())
+    assert (velocities[0] == velocities[1]).all()
+
+
 @pytest.mark.slow
 def test_zero_actions_are_not_enough():
     with contextlib.closing(EnvSpec(TASKS["quadruped-bow"][0]).as_deployed().make()) as env:

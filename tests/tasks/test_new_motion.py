@@ -130,3 +130,29 @@ def test_the_command_line_and_the_plugins_own_tests(folder):
     content = json.loads(run("rlctl", "tasks", "new", "dog-asks", *options, cwd=folder))
     assert content["target"] == "dog-asks/dog_asks/task.py:DogAsks"
     run("pytest", "-q", "-n", "0", "dog-asks", cwd=folder, path=folder / "dog-asks")
+
+
+def add_to_joints(folder, attributes: str, more: str = "") -> None:
+    """Give all joints of the dog attributes, and its file further sections."""
+    defaults = f"<default><joint {attributes}/></default><worldbody>"
+    text = (folder / "dog.xml").read_text().replace("<worldbody>", defaults)
+    (folder / "dog.xml").write_text(text.replace("</mujoco>", f"{more}</mujoco>"))
+
+
+def test_what_takes_time_and_is_not_needed_is_left_out(folder):
+    sensors = '<sensor><framepos objtype="body" objname="trunk"/></sensor>'
+    add_to_joints(folder, 'frictionloss="0.1"', sensors)
+    plugin = create("dog-is-fast", "bend_30hz.csv")
+    assert "leaves out dry friction of the joints, up to 0.1 N m" in plugin.summary
+    assert "The copy of dog.xml has no sensors" in plugin.summary
+    cls = EnvSpec(plugin.target).constructor()
+    with contextlib.closing(TaskWorlds(cls(), WORLDS)) as worlds:
+        assert worlds.task.sim.model.nsensor == 0
+        assert not worlds.task.body._sim.world.model("dof_frictionloss").any()
+
+
+def test_dry_friction_that_motors_notice_is_kept(folder):
+    add_to_joints(folder, 'frictionloss="2"')
+    plugin = create("dog-creaks", "bend_30hz.csv")
+    assert "dry friction" not in plugin.summary
+    assert not hasattr(read_task(plugin), "friction")

@@ -68,12 +68,18 @@ def list_candidates(
     """Return all single mistakes of the observations and of the actions; `normalize` is the policy's."""
     found = [] if normalize is None else [make_normalised(normalize)]
     slices = {name: slice(0, len(values.mean)) for name, values in statistics.items()}
-    commands = {"command", *find_command_ranges(info, slices)}  # the program sets them itself
+    # The program sets them itself.
+    commands = {"command", *find_command_ranges(info, slices), *_list_clips(info)}
     for name, values in statistics.items():
         if name in commands:
             continue
         found += _list_of_term(name, values, info, statistics)
     return found
+
+
+def _list_clips(info: EnvInfo) -> list[str]:
+    """Return the terms that are what a clip wants, of which nothing is measured."""
+    return [name for name, term in info.observation_terms.items() if term.kind == "playback" and not term.quantity]
 
 
 def _list_of_term(
@@ -209,6 +215,8 @@ def is_of_joints(name: str, values: TermStatistics, info: EnvInfo) -> bool:
     """Return whether an observation has a quantity of each joint that its driver measures."""
     joints = info.joints
     if joints is None or name == ACTIONS or len(values.mean) != len(joints.names):
+        return False
+    if name in _list_clips(info):
         return False
     return name == joints.measured or name.startswith("joint")
 

@@ -49,7 +49,7 @@ def diagnose(
     result = diagnose_log(
         log,
         source.policy,
-        source.spec,
+        source.spec,  # as trained: its short episodes start anywhere in a clip, as the rows of a log are
         columns=request.columns,
         limits=request.limits,
         seed=request.seed,
@@ -68,7 +68,7 @@ def _diagnose_deployment(source: "PolicyOrigin", seed: int, json: str | None) ->
     from rlctl_robot.diagnose.deployed import diagnose_deployment, show
 
     result = diagnose_deployment(
-        source.policy, source.spec, seed, report=lambda line: output.err().print(f"diagnose: {line}")
+        source.policy, source.spec.as_deployed(), seed, report=lambda line: output.err().print(f"diagnose: {line}")
     )
     show(result, json)
     result.check()

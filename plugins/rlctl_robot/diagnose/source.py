@@ -38,5 +38,5 @@ def find_source(policy: str | None, checkpoint: str, changes: EnvChanges = UNCHA
                 other = PolicyFile.read(file)
                 if own.info.env.find_difference(other.info.env) is None:
                     others.append(check_playable(other).actor_only())
-    spec = found.locate(own.info.derive_spec(changes=changes)).as_deployed()
+    spec = found.locate(own.info.derive_spec(changes=changes))
     return PolicyOrigin(own, spec, tuple(others), found.notes)

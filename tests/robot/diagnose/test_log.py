@@ -7,9 +7,9 @@ import pytest
 
 from rlctl.errors import ArtifactError
 from rlctl.task.joints import Joints
-from rlctl.task.terms import Distance, LastAction
+from rlctl.task.terms import Distance, LastAction, Playback
 from rlctl_robot.diagnose import table
-from rlctl_robot.diagnose.candidates import TermStatistics, list_candidates
+from rlctl_robot.diagnose.candidates import TermStatistics, is_of_joints, list_candidates
 from rlctl_robot.diagnose.log import read_robot_log
 from tests.limits.conftest import make_arm
 
@@ -236,6 +236,22 @@ def test_a_command_is_not_corrected(info):
     statistics = {name: TermStatistics(np.zeros(3), np.ones(3)) for name in ("command", "goal", "hand")}
     info = info.model_copy(update={"command_ranges": {f"goal_{axis}": (0.0, 1.0) for axis in "xyz"}})
     assert {one.term for one in list_candidates(info, statistics)} == {"hand"}
+
+
+def test_what_a_clip_wants_is_not_corrected(info):
+    statistics = {name: TermStatistics(np.zeros(3), np.ones(3)) for name in ("motion", "joint_error")}
+    row = [[0.0, 0.0, 0.0]]
+    clip = {"motion": Playback(row, 0.02), "joint_error": Playback(row, 0.02, "joint_positions")}
+    info = info.model_copy(update={"observation_terms": clip})
+    assert {one.term for one in list_candidates(info, statistics)} == {"joint_error"}
+
+
+def test_what_a_clip_wants_of_the_joints_is_not_what_their_driver_measures(info):
+    joints = Joints(["shoulder", "elbow"], default_positions=[0.1, -0.5])
+    terms = {"joints": Playback([[0.0, 0.0]], 0.02), "joint_error": Playback([[0.0, 0.0]], 0.02, "joint_positions")}
+    info = info.model_copy(update={"joints": joints, "observation_terms": terms})
+    values = TermStatistics(np.zeros(2), np.ones(2))
+    assert [name for name in terms if is_of_joints(name, values, info)] == ["joint_error"]
 
 
 def test_a_swap_of_a_programs_own_angles(info):

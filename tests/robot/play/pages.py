@@ -59,6 +59,7 @@ class Page:
 def play(task, *, sim=None, output=None, record=False):
     """Play the shipped policy of a task; yields the page, and the list of results, which is filled at the end."""
     source = PolicySource(ReplayRequest(task, checkpoint="pretrained", sim=sim, output=output))
+    spec = source.spec.as_deployed()
     controls, results = Controls(record=record), []
     server = PageServer(0, controls)
     address = server.start()
@@ -66,8 +67,8 @@ def play(task, *, sim=None, output=None, record=False):
 
     def run():
         try:
-            with contextlib.closing(make_drawable(source.spec)) as env:
-                results.append(Game(env, source.spec, source, controls, server).play(0))
+            with contextlib.closing(make_drawable(spec)) as env:
+                results.append(Game(env, spec, source, controls, server).play(0))
         except BaseException as error:
             failures.append(error)
 

@@ -50,6 +50,22 @@ def test_a_walker_follows_commands_pushes_and_the_clock():
     assert results[0].episodes == 2
 
 
+@pytest.mark.slow
+def test_a_clip_is_played_to_its_end_and_begins_again_and_a_push_acts_while_it_runs():
+    with play("quadruped-bow") as (page, results):
+        page.send(speed=2.0)
+        for passed in (2.0, 4.0):  # a wait has a limit, and other programs may run
+            page.wait_for(lambda frame, passed=passed: frame["time"] > passed)
+        ended = page.wait_for(lambda frame: frame["state"] == "ended")
+        assert ended["time"] == pytest.approx(5.4)  # a robot begins with the clip, in any episode
+        again = page.wait_for(lambda frame: not frame["state"])
+        assert again["time"] == 0.0
+        page.send(push=[0.0, 1.0])
+        pushed = page.wait_for(lambda frame: frame["center"][1] > again["center"][1] + 0.02)
+        assert pushed["time"] < 1.0
+    assert results[0].episodes == 2
+
+
 def test_a_goal_is_moved_and_recorded(tmp_path):
     with play("reach", sim=MUJOCO, output=tmp_path) as (page, results):
         page.wait_for(lambda frame: True)
