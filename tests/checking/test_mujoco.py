@@ -103,7 +103,7 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
             ("left_hip, follows the position of joint left_knee",),
         ),
         ("joints.py:RL816ArmIncrementsTooFar", "RL816", ("ctrl[2] (bend)", "opposite action then changes nothing")),
-        ("joints.py:RL119HopperInDegrees", "RL119", ("joint left_hip in degrees", "is in rad/s")),
+        ("joints.py:RL119HopperInDegrees", "RL119", ("position of joint left_hip, in degrees", "57.3 times")),
         ("joints.py:RL819HopperSpeedsInOtherOrder", "RL819", ("the speeds of left_hip, right_hip",)),
         ("joints.py:RL820ArmVelocityOfSubsteps", "RL820", ("divided by 0.004 s", "5 times too large")),
         ("RL116HopperQuaternion", "RL116", ("of body", "(w, x, y, z) read as x, y, z, w")),
