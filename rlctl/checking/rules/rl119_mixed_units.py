@@ -60,6 +60,8 @@ LARGE = 100.0  # root mean square of what is in millimetres
 @judges_records(RULE, *rewards.WITH_SEARCH, "worlds", "goals")  # "worlds" compares with the state of the engine
 def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
+    if any(finding.rule == RULE.id for finding in records.findings):
+        return  # the engine's values have told it
     scaled: ScaledGoal | None = records.facts.get(SCALED_GOAL)
     if scaled is not None and scaled.size >= LEAST_LARGE:
         yield _describe_scaled(scaled)
