@@ -107,7 +107,7 @@ def _get_bodies(pair: Pair) -> frozenset[int]:
 
 
 def _asks_in_bullet(watched: WatchedWorlds, world: LoggedWorld) -> bool:
-    """Say whether the environment asks PyBullet for contacts without naming two links or two bodies."""
+    """Say whether the environment asks PyBullet for contacts without naming both bodies, and gets some."""
     for query in watched.calls.queries.values():
         if query.client == world.world.client and query.contacts and -1 in query.bodies:
             return True
