@@ -13,10 +13,14 @@ CRATE = """<geom name="floor" type="plane" size="9 9 1"/><body name="crate" pos=
 class PusherTouches(Pusher):
     """It sees whether its crank touches the cube, which is too far away for most actions."""
 
+    rlctl_ignore = {**Pusher.rlctl_ignore, "RL110": "a consequence"}
     placed = (0.4, 0.3, 0.03)
 
     def size(self):
         return super().size() + 1
+
+    def info(self, success):
+        return {"is_success": p.getBasePositionAndOrientation(self.cube, physicsClientId=self.client)[0][1] > 0.35}
 
     def contacts(self):
         return p.getContactPoints(self.robot, self.cube, physicsClientId=self.client)
@@ -78,7 +82,11 @@ class PuckWithWall(Puck):
 
 
 class RL825PuckEndsOnTheGround(PuckWithWall):
-    rlctl_ignore = {**PuckWithWall.rlctl_ignore, "RL504": "a consequence"}
+    rlctl_ignore = {
+        **PuckWithWall.rlctl_ignore,
+        "RL302": "contacts are not reset, and each episode is their first step",
+        "RL504": "a consequence",
+    }
 
     def has_failed(self):
         return len(p.getContactPoints(self.robot, physicsClientId=self.client)) > 0
@@ -111,6 +119,8 @@ class RL825ArmAnything(ArmBumps):
 class CartBumps(Bumps, Cart):
     """Where its body touches anything."""
 
+    rlctl_ignore = {"RL306": "it does not see its heading"}
+
     xml = CART.replace('<geom type="box"', '<geom name="trunk" type="box"')
 
     def has_bumped(self):
@@ -124,6 +134,8 @@ class RL825CartStands(CartBumps):
 
 class FlyerBumps(Bumps, Flyer):
     """Where it touches the crate or the floor; the crate is far away on the floor."""
+
+    rlctl_ignore = {"RL306": "it does not see its heading", "RL110": "it never tilts"}
 
     xml = FLYER.replace("</worldbody>", CRATE).replace('<geom type="box"', '<geom name="hull" type="box"')
 

@@ -19,6 +19,9 @@ class PusherFar(PusherMeasures):
 
     placed = (0.9, 0.5, 0.03)
 
+    def info(self, success):
+        return {"is_success": p.getBasePositionAndOrientation(self.cube, physicsClientId=self.client)[0][1] > 0.55}
+
 
 class RL820PusherFarPerPhysicsStep(PerPhysicsStep, PusherFar): ...
 
@@ -26,6 +29,7 @@ class RL820PusherFarPerPhysicsStep(PerPhysicsStep, PusherFar): ...
 class ArmWithBall(MujocoArm):
     """Nothing moves the ball; its velocity has a name."""
 
+    rlctl_ignore = {"RL110": "the ball keeps its place"}
     xml = ARM.replace("</worldbody>", BALL)
     last = None
 
@@ -78,7 +82,8 @@ class Undivided:
         return 1.0
 
 
-class RL820FlyerUndivided(Undivided, FlyerMeasures): ...
+class RL820FlyerUndivided(Undivided, FlyerMeasures):
+    rlctl_ignore = {"RL110": "it never tilts"}
 
 
 class RL820CartUndivided(Undivided, CartMeasures): ...
