@@ -181,6 +181,7 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
     means the policy that ships with the task, never that of a run. Raises `ArtifactError` if it is not a policy.
     """
     from rlctl.environments import installed
+    from rlctl.errors import ArtifactError, did_you_mean
     from rlctl.hub import store
     from rlctl.policy import load
     from rlctl.policy.shipped import find_shipped_policy
@@ -191,6 +192,11 @@ def load_policy(path: str | os.PathLike[str], /) -> Policy:
         file = store.fetch(name)
     elif not file.suffix and installed.find(name) is not None:
         file = find_shipped_policy(name)
+    elif not file.suffix and not file.exists():
+        close = did_you_mean(name, [entry.name for entry in installed.list_installed()])
+        raise ArtifactError(
+            f"{name}: no such file, and no installed task.{close} The newest run's policy: load_policy('runs/latest')"
+        )
     if RunDirectory(file).status_file.is_file():
         file = RunDirectory(file).policy_file()
     return load.load_policy(file)

@@ -156,11 +156,11 @@ def choose_checkpoint(checkpoint: str, pretrained: bool) -> str:
 
 def parse_changes(settings: list[str], sim: Engine | None = None) -> EnvChanges:
     """Read the `--set` options and the engine of a command that changes an environment; `--sim` overrides `--set`."""
-    from rlctl.environments.spec import UNCHANGED
+    from rlctl.engine import Engine
+    from rlctl.environments.spec import EnvChanges
 
-    changes = UNCHANGED
-    if settings:
-        from rlctl.recipe.sources import parse_changes  # takes a quarter of a second
+    if not settings:
+        return EnvChanges(sim=sim or Engine())
+    from rlctl.recipe.sources import parse_changes  # takes a quarter of a second
 
-        changes = parse_changes(settings)
-    return changes if sim is None else dataclasses.replace(changes, sim=sim)
+    return parse_changes(settings, sim)

@@ -3,7 +3,7 @@
 import pytest
 
 import rlctl
-from rlctl.errors import RecipeError, UsageError
+from rlctl.errors import ArtifactError, RecipeError, UsageError
 from tests.training.conftest import ENVS, TINY
 
 
@@ -25,6 +25,14 @@ def test_train_and_evaluate_with_the_keys_of_a_recipe(tmp_path):
     assert repr(result) == f"TrainResult({ENVS}:Line, ppo, 64 steps, run {str(result.run.path)!r})"
     assert repr(rlctl.load_policy(result.run.path)) == f"Policy({ENVS}:Line, ppo, 64 steps)"
     assert rlctl.evaluate(result.run.path, episodes=3, seed=4).returns == evaluation.returns
+
+
+def test_a_policy_that_is_not_there(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ArtifactError, match=r"^reeach: no such file.*Did you mean 'reach'\? .*'runs/latest'"):
+        rlctl.load_policy("reeach")
+    with pytest.raises(ArtifactError, match=r"^gone\.safetensors: no such file$"):
+        rlctl.load_policy("gone.safetensors")
 
 
 def test_keys_are_checked_as_on_the_command_line():

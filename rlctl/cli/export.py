@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rlctl.arguments import choose_checkpoint, command
+from rlctl.engine import Engine
 from rlctl.errors import UsageError
 from rlctl.exporting.export_request import DatasetFormat, ExportRequest, Format
 from rlctl.options import Argument, Checkpoint, Json, Option, Pretrained, RunName, SimOption
@@ -56,12 +57,21 @@ def export(
         raise UsageError("--policy FILE writes only that file: leave out --output, --onnx, --c and --controller")
     if policy is not None and sim is not None:
         raise UsageError("--policy FILE contains the score in the engine of the training: leave out --sim")
-    both = onnx == c if controller else onnx and c
     formats: tuple[Format, ...] = ("c",) if c else ("onnx",)
-    if both:
+    if (onnx and c) or (controller and onnx == c):  # of a controller both are the default
         formats = ("onnx", "c")
     request = ExportRequest(
-        run, formats, checkpoint, output, policy, episodes, dataset, controller, limits, sim, mapping
+        run,
+        formats,
+        checkpoint,
+        output,
+        policy=policy,
+        episodes=episodes,
+        dataset=dataset,
+        controller=controller,
+        limits=limits,
+        sim=sim or Engine(),
+        mapping=mapping,
     )
     if dataset is not None:
         if onnx or c or controller or policy is not None:

@@ -109,12 +109,6 @@ class EnvSpec:
         """Return the spec with the default engine if PyBullet is not installed, as where a policy comes from."""
         return dataclasses.replace(self, sim=Engine()) if self.lacks_pybullet else self
 
-    def with_engine(self, sim: Engine | None) -> EnvSpec:
-        """Return the spec in the engine of `--sim`; without that option in its own, if it is installed."""
-        if sim is None:
-            return self.replace_missing_engine()
-        return dataclasses.replace(self, sim=sim)
-
     def wrap(self, env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         """Return an environment with the wrappers that change its observations; raises `RecipeError`."""
         from rlctl.task.env import TaskEnv
@@ -148,7 +142,7 @@ class EnvSpec:
         return dataclasses.replace(self, sim=choose_engine(task))
 
     @property
-    def engine(self) -> str:
+    def engine_title(self) -> str:
         """The name of the physics engine, for people; empty for a plain environment. The task is imported."""
         if not is_task(self.constructor()):
             return ""

@@ -35,7 +35,7 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     trained = "" if info is None else f" ({info.algo}, step {info.training_steps:,})"
     out.print(f"{result.spec.task}: {'policy ' if info is None else ''}{result.name}{trained}")
     episodes = output.format_count(len(result.played), "episode")
-    settings = f"seed {result.seed}{mode}", result.spec.engine, describe_randomization(result.events)
+    settings = f"seed {result.seed}{mode}", result.spec.engine_title, describe_randomization(result.events)
     out.print(", ".join(filter(None, [episodes, *settings])))
     if result.spec.stage and info is not None:
         out.print(f"stage {result.spec.stage} of {len(info.stages)}")

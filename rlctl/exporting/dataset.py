@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl import output
-from rlctl.engine import Engine
 from rlctl.environments.dict_spaces import split
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.registry import make_slug
@@ -38,7 +37,7 @@ def export_dataset(request: ExportRequest) -> dict[str, Any]:
             importlib.import_module(package)
     except ImportError as error:
         raise UsageError(explain_missing_package(f"--dataset {request.dataset}", error.name, "demos")) from None
-    changes = EnvChanges(sim=request.sim or Engine())
+    changes = EnvChanges(sim=request.sim)
     played = EvalRequest(request.run, checkpoint=request.checkpoint, episodes=request.episodes, changes=changes)
     source, policy, spec = find_player(played)
     task, default = make_slug(spec.task), source.run.path / "exports" if source.run is not None else Path()

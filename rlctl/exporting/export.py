@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rlctl import output
 from rlctl.engine import Engine
 from rlctl.environments.info import EnvInfo
+from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
 from rlctl.exporting.export_request import ExportRequest
 from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
@@ -165,7 +166,7 @@ def find_source(request: ExportRequest, name: str) -> tuple[FoundPolicy, Path]:
     return source, target
 
 
-def _export(source: FoundPolicy, targets: list[Path], sim: Engine | None) -> list[ExportReport]:
+def _export(source: FoundPolicy, targets: list[Path], sim: Engine) -> list[ExportReport]:
     policy = check_playable(PolicyFile.read(source.file))
     info = policy.info
     has_own = any(isinstance(info.policy_kwargs.get(key), dict) for key in KEYS)
@@ -174,7 +175,7 @@ def _export(source: FoundPolicy, targets: list[Path], sim: Engine | None) -> lis
         import_named(source.run.recipe().policy_kwargs)
     # The environments are built while torch is imported.
     n_envs = 1
-    spec = source.locate(info.spec.with_engine(sim))
+    spec = source.locate(info.derive_spec(changes=EnvChanges(sim=sim)))
     with contextlib.suppress(UsageError, TaskError):  # `_check_environment` says what does not build
         n_envs = count_envs(spec, EPISODES)
     with Workers(spec, n_envs) as workers:

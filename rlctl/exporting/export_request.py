@@ -26,7 +26,8 @@ class ExportRequest:
 
     controller: bool = False  # write the controller: from what a robot measures to joint targets within limits
     limits: Path | None = None  # of the controller
-    sim: Engine | None = None  # engine of the episodes that are compared; default: that of the training
+    sim: Engine = Engine()  # noqa: RUF009 (it cannot change)
+    """Engine of the episodes that are compared; no choice: that of the training."""
     mapping: Path | None = None  # between a program's values and the controller's
 
     def __post_init__(self) -> None:

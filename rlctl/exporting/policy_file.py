@@ -32,7 +32,7 @@ def export_actor(request: ExportRequest) -> PolicyFile:
     output.print_notes(source.notes)
     origin = _find_origin(source)
     policy = PolicyFile.read(source.file)
-    spec = source.locate(policy.info.spec.replace_missing_engine())
+    spec = source.locate(policy.info.derive_spec())
     evaluation = EvalRequest(run=str(source.file), episodes=request.episodes)
     score = measure_score(evaluation)
     scores = {name: measure_score(dataclasses.replace(evaluation, baseline=name, spec=spec)) for name in BASELINES}

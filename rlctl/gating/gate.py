@@ -243,7 +243,7 @@ class _Findings:
         assert target is not None
         form: Format = "c" if target.suffix == ".c" else "onnx"
         options = self._request.evaluation
-        request = ExportRequest(options.run, (form,), options.checkpoint, target, sim=options.changes.sim or None)
+        request = ExportRequest(options.run, (form,), options.checkpoint, target, sim=options.changes.sim)
         reports = export_policy(request)
         self.exported = reports
         self._show(reports)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
-from rlctl.environments.named_task import RUN
 from rlctl.errors import ArtifactError, TaskError
 from rlctl.launching.findings import WarnOfFindings
 from rlctl.launching.tracking import SendToTracker, track
@@ -55,7 +54,7 @@ def run_training(request: TrainRequest, find: Callable[[TrainRequest], Start] = 
     with StopSignals() as signals, find(request) as start:
         if start.run is not None and start.checkpoint is not None and start.checkpoint.state.progress.done:
             return _report_finished(start, start.run, start.checkpoint.state.progress)
-        engine = start.recipe.env_specs(start.task, named_by=RUN if start.run else "")[-1].engine
+        engine = start.env_specs[-1].engine_title
         how = ", ".join(filter(None, [start.recipe.algo, engine]))
         verb = "train" if start.teacher is None else "distill"
         if start.run is not None:

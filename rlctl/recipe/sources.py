@@ -1,5 +1,6 @@
 """Merges the sources of a recipe: a task's packaged YAML, then `--config`, then `--set` and the other flags."""
 
+import dataclasses
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -216,9 +217,13 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
     return result
 
 
-def parse_changes(settings: list[str]) -> EnvChanges:
-    """Parse the `--set` texts that change an environment; raises `RecipeError` for any other key."""
-    return check_changes(parse_settings(settings), "--set")
+def parse_changes(settings: list[str], sim: Engine | None = None) -> EnvChanges:
+    """Parse the `--set` texts that change an environment; raises `RecipeError` for any other key.
+
+    `sim` is the engine of `--sim`, which overrides that of `--set`.
+    """
+    changes = check_changes(parse_settings(settings), "--set")
+    return changes if sim is None else dataclasses.replace(changes, sim=sim)
 
 
 def check_changes(values: Mapping[str, Any], source: str) -> EnvChanges:

@@ -11,7 +11,7 @@ from rlctl import output
 from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.info import describe
 from rlctl.environments.registry import make_slug
-from rlctl.environments.spec import EnvChanges, EnvSpec
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.evaluation.players import Baseline, LoadedPolicy, choose_task, load_baseline, load_player
 from rlctl.play.episode import RecordedEpisode, load_episode, save_episode, save_next_episode
@@ -176,7 +176,7 @@ class PolicySource(_NewEpisodes):
         self._file, self._run = policy.file, policy.run
         self._policy = load_policy(self._file)
         info = self._policy.info
-        spec = policy.locate(info.derive_spec(request.task, _read_changes(request)))
+        spec = policy.locate(info.derive_spec(request.task, parse_changes(request.settings, request.sim)))
         self.name = f"{self._file.name}, {info.algo}, step {info.training_steps:,}"
         self.described = f"{self._file} ({info.algo}, step {info.training_steps:,})"
         super().__init__(request, spec, load_player(self._file, deterministic=True))
@@ -209,7 +209,7 @@ class TaskSource(_NewEpisodes):
             _check_reference(request)
             check_has_reference(spec)
             spec = spec.as_deployed()
-        spec = _read_changes(request).apply(spec)
+        spec = parse_changes(request.settings, request.sim).apply(spec)
         self._baseline = Baseline("zero") if self._is_reference else load_baseline(policy)
         self.name = self.described = REFERENCE if self._is_reference else self._baseline.title
         self._other_clients = find_clients()
@@ -302,11 +302,6 @@ def load_located(path: Path) -> RecordedEpisode:
         )
     spec = dataclasses.replace(episode.info.spec, task=locate_task(episode.info.spec.task, find_owner(path)))
     return dataclasses.replace(episode, info=episode.info.model_copy(update={"spec": spec}))
-
-
-def _read_changes(request: ReplayRequest) -> EnvChanges:
-    changes = parse_changes(request.settings) if request.settings else EnvChanges()
-    return changes if request.sim is None else dataclasses.replace(changes, sim=request.sim)
 
 
 def summarize(rollout: Rollout, recording: Path | None = None, episode: Path | None = None) -> ReplayedEpisode:

@@ -549,9 +549,9 @@ def choose_engine(task: type) -> Engine:
 
 
 def _make_sim(
-    task: Task | BatchTask, worlds: int, sim: Engine, render_mode: RenderMode, *, visuals: bool
+    task: Task | BatchTask, worlds: int, asked: Engine, render_mode: RenderMode, *, visuals: bool
 ) -> PybulletSim | MujocoSim:
-    engine, iterations = sim or choose_engine(type(task)), task.solver_iterations
+    engine, iterations = asked or choose_engine(type(task)), task.solver_iterations
     dt, substeps, is_batch = task.control_dt, task.substeps, isinstance(task, BatchTask)
     if engine.name != "mujoco" and is_batch:
         raise UsageError(f"{type(task).__name__} simulates its worlds in MuJoCo: sim: mujoco, or --sim mujoco")

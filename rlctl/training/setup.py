@@ -18,7 +18,6 @@ from rlctl.checking.rule import Severity
 from rlctl.checking.rules import find_rules
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
-from rlctl.environments.named_task import RUN
 from rlctl.environments.registrations import describe_registrations
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, RecipeError, TaskError
@@ -56,7 +55,7 @@ def set_up(
 ) -> Iterator[TrainingLoop]:
     """Open what a training needs; at the end stop its processes, and write an error that ended it to the run."""
     recipe, request = start.recipe, start.request
-    specs = [spec.resolve() for spec in recipe.env_specs(start.task, named_by=RUN if start.run else "")]
+    specs = [spec.resolve() for spec in start.env_specs]
     display.phase(f"building {format_count(recipe.n_envs, 'environment')}, importing PyTorch")
     with contextlib.ExitStack() as stack:
         stack.callback(printed.report)

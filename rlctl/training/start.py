@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlctl.environments import named_task, registry
+from rlctl.environments.named_task import RUN
 from rlctl.environments.registry import describe_task_changes
+from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError, explain_missing_package
 from rlctl.hub import store
 from rlctl.policy import own_modules
@@ -63,6 +65,11 @@ class Start(contextlib.AbstractContextManager["Start"]):
             self.lock.release()
 
     @property
+    def env_specs(self) -> list[EnvSpec]:
+        """The environments of the curriculum's stages; a run's file names the task of a resumed one."""
+        return self.recipe.env_specs(self.task, named_by="" if self.run is None else RUN)
+
+    @property
     def stage(self) -> int:
         """Stage of the curriculum, from 1."""
         return (self.checkpoint.state.progress.stage or 1) if self.checkpoint else 1
@@ -81,7 +88,7 @@ class Start(contextlib.AbstractContextManager["Start"]):
 def find_start(request: TrainRequest) -> Start:
     """Check a request and return its start; nothing is changed yet."""
     check_arguments(request)
-    return _find_checkpoint(request) if request.task is None else _find_new(request, request.task)
+    return _find_resumed(request) if request.task is None else _find_new(request, request.task)
 
 
 def check_arguments(request: TrainRequest) -> None:
@@ -123,7 +130,7 @@ def _find_new(request: TrainRequest, task: str) -> Start:
     return Start(request, task, recipe, notes=tuple(notes), callbacks=callbacks, source=source, demos=demos)
 
 
-def _find_checkpoint(request: TrainRequest) -> Start:
+def _find_resumed(request: TrainRequest) -> Start:
     from rlctl.training import checkpoint_file
 
     run = lookup.find_run(request.resume, request.root, to_train=True)
@@ -153,10 +160,21 @@ def _find_checkpoint(request: TrainRequest) -> Start:
                 f"{run.path}: its recipe names {names[0]}, and a run that was downloaded imports nothing; "
                 f"to train further with it: rlctl train {task} --config {run.recipe_file} --from {run.path}"
             )
-        callbacks, source, demos = _load_callbacks(recipe), status.get("from"), status.get("demos")
-        teacher = Teacher.of_run(run, entry) if (entry := status.get("teacher")) is not None else None
-        sources = callbacks, source, demos, teacher
-        return Start(request, task, recipe, run, lock, newest, tuple(notes), *sources, tuple(changes))
+        entry = status.get("teacher")
+        return Start(
+            request,
+            task,
+            recipe,
+            run,
+            lock,
+            newest,
+            notes=tuple(notes),
+            callbacks=_load_callbacks(recipe),
+            source=status.get("from"),
+            demos=status.get("demos"),
+            teacher=None if entry is None else Teacher.of_run(run, entry),
+            inexact=tuple(changes),
+        )
     except BaseException:
         lock.release()
         raise

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.engine import Engine
+from rlctl.environments.spec import EnvChanges
 from rlctl.policy.file import PolicyFile
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.policy import Policy
@@ -87,11 +88,11 @@ class BrokenLog:
 class Robot:
     """A task's simulation and its shipped policy."""
 
-    def __init__(self, task: str, sim: Engine | None = None) -> None:
+    def __init__(self, task: str, sim: Engine = Engine()) -> None:  # noqa: B008 (it cannot change)
         self.task, self.file = task, find_shipped_policy(task)
         self.policy_file = PolicyFile.read(self.file)
         self.info = self.policy_file.info
-        self.spec = self.info.derive_spec().with_engine(sim)
+        self.spec = self.info.derive_spec(changes=EnvChanges(sim=sim))
         self.env: Any = self.spec.make()
         self.policy = Policy(NumpyActor(self.policy_file))
         self.sizes = dict(self.info.env.observation_sizes)

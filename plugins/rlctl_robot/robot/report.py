@@ -25,7 +25,7 @@ def show(report: RobotReport, json: str | None, gates: Gates) -> None:
     if not report.scores:
         return
     episodes = output.format_count(len(report.scores[0].episodes), "episode")
-    settings = f"seed {report.seed}", report.spec.engine, describe_randomization(report.info.events)
+    settings = f"seed {report.seed}", report.spec.engine_title, describe_randomization(report.info.events)
     out.print(", ".join(filter(None, [episodes, *settings])))
     has_success = report.scores[0].outcome.success_rate is not None
     columns = (

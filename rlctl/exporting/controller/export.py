@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from rlctl import output
-from rlctl.engine import Engine
 from rlctl.environments.info import describe
-from rlctl.environments.spec import EnvSpec
+from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.c_source import FLAGS, find_compiler
 from rlctl.exporting.controller import verify
@@ -84,7 +83,7 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
     pin_threads()
     with output.show_progress("loading the policy"):
         torch_actor = TorchActor.load(source.file)
-    spec = _choose_spec(source.locate(torch_actor.info.spec), request.sim)
+    spec = _choose_spec(source.locate(torch_actor.info.derive_spec(changes=EnvChanges(sim=request.sim))))
     try:
         with output.show_progress("building the environment"):
             env = spec.make()
@@ -105,9 +104,9 @@ def export_controller(request: ExportRequest) -> list[ExportReport]:
         env.close()
 
 
-def _choose_spec(spec: EnvSpec, sim: Engine | None) -> EnvSpec:
+def _choose_spec(spec: EnvSpec) -> EnvSpec:
     """Return the environment of the verification: without events, because noise acts on computed terms."""
-    return dataclasses.replace(spec.as_deployed().with_engine(sim), randomize=False, events={})
+    return dataclasses.replace(spec.as_deployed(), randomize=False, events={})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

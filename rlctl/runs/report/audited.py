@@ -23,7 +23,7 @@ def audit_run(run: RunDirectory, *, env_timeout_s: float) -> None:
 
     which = "best" if run.best_policy.is_file() else "last"
     file = run.policy_file(which)
-    spec = FoundPolicy(file, run).locate(PolicyFile.read_info(file).spec.replace_missing_engine())
+    spec = FoundPolicy(file, run).locate(PolicyFile.read_info(file).derive_spec())
     spec.constructor()  # raises for a file that names anything but an environment
     bare = dataclasses.replace(spec.observe_as(EnvSpec(spec.task)), stage=0)
     report = audit(bare, env_timeout_s=env_timeout_s, learned=file.resolve())
