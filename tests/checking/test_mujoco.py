@@ -168,6 +168,6 @@ def test_a_fix_names_the_calls_of_the_own_engine():
 def test_fix_speaks_of_the_file_where_the_mistake_is():
     (in_file,) = findings("broken_mujoco.py:RL810HopperRangesInDegrees", "RL810")
     (in_code,) = findings("broken_mujoco.py:RL810ArmDegrees", "RL810")
-    assert "in the XML" in in_file.fix
+    assert "In the XML" in in_file.fix
     assert "np.deg2rad" in in_code.fix
     assert "(likewise" in in_code.message
