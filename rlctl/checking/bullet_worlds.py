@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -88,6 +89,30 @@ def read_poses(world: World) -> Poses:
         for link, state in zip(links, p.getLinkStates(body.id, links, computeForwardKinematics=1) or (), strict=False):
             poses[body.id, link] = np.array([*state[4], *state[5], *state[0]])
     return poses
+
+
+def read_points(world: World) -> Array:
+    """Return place and velocity of each link of a robot and each base that is free, as `StateReader` has them."""
+    p = ClientCalls(world.client)
+    rows = []
+    for body in world.bodies:
+        if body.is_free:
+            position, quaternion = p.getBasePositionAndOrientation(body.id)
+            rows.append([*position, *position, *quaternion, *np.ravel(p.getBaseVelocity(body.id))])
+        links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
+        states = p.getLinkStates(body.id, links, computeLinkVelocity=1, computeForwardKinematics=1) if links else ()
+        rows += [[*state[4], *state[0], *state[5], *state[6], *state[7]] for state in states or ()]
+    return np.array(rows, np.float64).reshape(-1, 16)
+
+
+def name_points(world: World) -> list[str]:
+    """Name the rows of `read_points`."""
+    names = []
+    for body in world.bodies:
+        names += [world.link_name((body.id, -1))] if body.is_free else []
+        links = range(min(MOST_LINKS, len(body.links) - 1)) if body.joints else ()
+        names += [world.link_name((body.id, link)) for link in links]
+    return names
 
 
 def read_physics(client: int) -> tuple[list[float], float]:
@@ -193,6 +218,20 @@ class BulletStateReader:
     def read_poses(self) -> Poses:
         """See `StateReader`."""
         return read_poses(self.world)
+
+    def name_points(self) -> list[str]:
+        """See `StateReader`."""
+        return name_points(self.world)
+
+    def read_points(self) -> Array:
+        """See `StateReader`."""
+        return read_points(self.world)
+
+    def throw(self, bodies: Sequence[WorldBody], velocities: Array) -> None:
+        """See `StateReader`."""
+        p = ClientCalls(self.world.client)
+        for body, velocity in zip(bodies, velocities.tolist(), strict=True):
+            p.resetBaseVelocity(body.id, velocity[:3], velocity[3:])
 
     def read_contacts(self) -> dict[Pair, float]:
         """See `StateReader`."""

@@ -6,11 +6,12 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rlctl.environments.bullet_calls import LIBRARIES
+from rlctl.environments.bullet_calls import LIBRARIES, is_library
 
 STEPS, RESETS = ("mj_step", "mj_step2"), ("mj_resetData", "mj_resetDataKeyframe")
 FORWARD = "mj_forward"
 FORCES = "mj_rnePostConstraint"  # computes forces from what a step left
+CONTACTS = ("ncon", "contact")  # of MjData
 LOOKUPS = ("body", "geom", "site")  # methods of MjModel and MjData that find a part by its name
 
 
@@ -30,6 +31,7 @@ class MujocoCalls:
     """Gives back, for a `with` block, what a step left and `after_step` changed."""
     other_names: dict[tuple[str, str], str] = dataclasses.field(default_factory=dict)
     """Other names that a look-up finds, by kind (of `LOOKUPS`) and asked name."""
+    reads_contacts: bool = False  # whether the environment ever looked at data.ncon or data.contact
     asked: dict[tuple[str, str], None] = dataclasses.field(default_factory=dict)  # kind and name of every look-up
 
     def rename(self, kind: str, name: Any) -> Any:
@@ -54,7 +56,21 @@ def join_calls(calls: MujocoCalls) -> Iterator[None]:
             for kind in LOOKUPS:
                 stack.callback(setattr, owner, kind, getattr(owner, kind))
                 setattr(owner, kind, _rename(calls, kind, getattr(owner, kind)))
+        for field in CONTACTS:
+            stack.callback(setattr, library.MjData, field, getattr(library.MjData, field))
+            setattr(library.MjData, field, _watch(calls, getattr(library.MjData, field)))
         yield
+
+
+def _watch(calls: MujocoCalls, field: property) -> property:
+    """Return a property like another one, which notes that the environment read it."""
+
+    def read(data: Any) -> Any:
+        if not calls.reads_contacts and not is_library(sys._getframe(1)):
+            calls.reads_contacts = True
+        return field.__get__(data)
+
+    return property(read, field.__set__)
 
 
 def _find_importers(name: str, function: Any) -> list[Any]:

@@ -4,6 +4,7 @@
 brought up to date at each `update`, and read.
 """
 
+import functools
 import math
 import sys
 from collections.abc import Sequence
@@ -191,6 +192,39 @@ class MujocoStateReader:
                     poses[body.id, number - 1] = np.concatenate([data.xpos[link], quaternion, data.xipos[link]])
         return poses
 
+    @functools.cached_property
+    def _point_bodies(self) -> list[int]:
+        """MuJoCo's bodies that are links of what moves."""
+        moving = [body for body in self.world.bodies if body.is_free or body.joints]
+        return [link for body in moving for link in self._links[body.id][: MOST_LINKS + 1]]
+
+    @functools.cached_property
+    def _point_sites(self) -> list[int]:
+        bodies = set(self._point_bodies)
+        return [site for site in range(self.model.nsite) if int(self.model.site_bodyid[site]) in bodies][:MOST_LINKS]
+
+    def name_points(self) -> list[str]:
+        """See `StateReader`."""
+        links = [self.world.link_name(self._link_of[body]) for body in self._point_bodies]
+        return [*links, *(f"site {self.model.site(site).name or site}" for site in self._point_sites)]
+
+    def read_points(self) -> Array:
+        """See `StateReader`."""
+        model, now = self.model, self._now
+        bodies, sites = self._point_bodies, self._point_sites
+        owners = [*bodies, *model.site_bodyid[sites].tolist()]
+        frames = np.vstack([now.xpos[bodies], now.site_xpos[sites]])
+        centres = np.vstack([now.xipos[bodies], now.site_xpos[sites]])
+        turning, linear = now.cvel[owners, :3], now.cvel[owners, 3:]  # at the centre of mass of the whole tree
+        velocities = linear + np.cross(turning, centres - now.subtree_com[model.body_rootid[owners]])
+        return np.hstack([frames, centres, np.roll(now.xquat[owners], -1, axis=1), velocities, turning])
+
+    def throw(self, bodies: Sequence[WorldBody], velocities: Array) -> None:
+        """See `StateReader`."""
+        for body, velocity in zip(bodies, velocities, strict=True):
+            first = int(self.model.jnt_dofadr[self.model.body_jntadr[body.id]])
+            self.data.qvel[first : first + 6] = velocity
+
     def read_before(self) -> tuple[list[Array], Poses] | None:
         """See `StateReader`; None where all substeps were one call."""
         if self._before is None or self._calls < 2:
@@ -218,6 +252,18 @@ class MujocoStateReader:
     def _link(self, geom: int) -> Link:
         body = int(self.model.geom_bodyid[geom])
         return self._link_of.get(body, (int(self.model.body_rootid[body]), -1))
+
+    def find_link(self, geom: int) -> Link:
+        """Return the link that a geom is a part of."""
+        return self._link(geom)
+
+    def find_geom(self, link: Link) -> int | None:
+        """Return a geom of a link that can touch something, of the world one that is no plane if it has one; None
+        where it has none."""
+        model = self.model
+        touches = (model.geom_contype | model.geom_conaffinity).astype(bool)
+        geoms = [geom for geom in np.flatnonzero(touches).tolist() if self._link(geom) == link]
+        return min(geoms, key=lambda geom: int(model.geom_type[geom]) in PLANES, default=None)
 
     def read_overlaps(self) -> dict[Pair, float]:
         """See `StateReader`."""

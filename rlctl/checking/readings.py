@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
@@ -47,14 +46,3 @@ def name_features(log: WorldLog) -> list[str]:
 def _name_state(body: WorldBody) -> list[str]:
     parts = [f"{what} of {body.name}" for what in ("position", "velocity", "angular velocity") for _ in range(3)]
     return parts + [f"{what} of {joint.name}" for what in ("position", "speed") for joint in body.joints]
-
-
-def find_lengths(log: WorldLog) -> NDArray[np.bool_]:
-    """Say which of the numbers of `read_features` are lengths [m] or their velocities [m/s]."""
-    are_lengths: list[bool] = []
-    for body in log.world.bodies:
-        if body.joints or body.is_free:
-            slides = [not joint.is_angle for joint in body.joints]
-            are_lengths += [True] * 6 + [False] * 3 + slides + slides
-        are_lengths += [False] * len(attitudes.NAMES) if body.is_free else []
-    return np.array(are_lengths + [True] * (6 * len(log.poses[0])))

@@ -79,6 +79,12 @@ def list_names(names: Sequence[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
+def list_others(names: Sequence[str], most: int = 4) -> str:
+    """Return all names but the first, for the end of a message about that one: ` (likewise knee, ankle)`; empty where
+    there is no other."""
+    return f" (likewise {list_names(names[1:], most)})" if len(names) > 1 else ""
+
+
 class NotJudged(Exception):
     """Raised by an experiment or a judge that has too little data to judge; the text is the reason."""
 

@@ -40,6 +40,18 @@ def flatten(observation: Any) -> NDArray[Any]:
     return array.ravel() if array.dtype.kind in "biuf" else np.zeros(0)
 
 
+def list_parts(observation: Any, name: str = "observation") -> Iterator[tuple[str, int]]:
+    """Yield the name and the size of each array of an observation, in the order of `flatten`."""
+    if isinstance(observation, dict):
+        for key, value in observation.items():
+            yield from list_parts(value, f"{name}[{key!r}]")
+    elif isinstance(observation, (tuple, list)) and any(isinstance(part, (np.ndarray, dict)) for part in observation):
+        for number, value in enumerate(observation):
+            yield from list_parts(value, f"{name}[{number}]")
+    else:
+        yield name, flatten(observation).size
+
+
 def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:
     """Yield the numbers of an info by name; those in a dictionary of it as `reward_terms/distance`."""
     for key, value in info.items():

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -11,11 +12,11 @@ import numpy as np
 
 from rlctl.checking.bullet_worlds import BulletStateReader, read_world
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.instance import Instance
+from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.values import flatten, flatten_action
+from rlctl.checking.values import flatten, flatten_action, list_parts
 from rlctl.checking.worlds import (
     ANGULAR,
     JOINTS,
@@ -38,6 +39,9 @@ DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy 
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm
 PART_OF_LINK = 0.25  # Between those two it is this part of the thinner link
 LASTING_STEPS = 3  # shorter events are impacts that the solver has not resolved yet
+THROWN_STEPS = 4  # until a body gets another velocity
+THROWN = np.array([[-0.5, -0.5, 0.5, -3.0, -3.0, -3.0], [0.5, 0.5, 1.5, 3.0, 3.0, 3.0]])
+"""Lowest and highest velocities of a body that is thrown, upwards so that nothing holds it [m/s], [rad/s]."""
 Place = dict[str, Any]
 """`seed`, `episode`, `actions` and `step` of a look at a world, as a finding's evidence; step 0 is the reset."""
 
@@ -57,7 +61,9 @@ class WorldLog:
     """Depth and limit [m] of free bodies that a reset puts into what moves."""
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
     poses: list[Poses] = dataclasses.field(default_factory=list)
+    points: list[Array] = dataclasses.field(default_factory=list)  # see `StateReader.read_points`
     observed: list[Array] = dataclasses.field(default_factory=list)  # flat observations
+    parts: list[tuple[str, int]] = dataclasses.field(default_factory=list)  # name and size of each of their arrays
     given: list[Array] = dataclasses.field(default_factory=list)  # flat actions; of reset empty
     before: list[tuple[list[Array], Poses] | None] = dataclasses.field(default_factory=list)
     """What the reader has of the moment before the last call that advanced the physics."""
@@ -73,9 +79,11 @@ class WorldLog:
             reader.update()
             states, contacts = reader.read_states(), reader.read_contacts()
             poses, targets = reader.read_poses(), reader.read_targets()
+            points = reader.read_points()
             deep = self._find_deep(contacts)
             if not self.places:
                 self.weights = reader.read_weights()
+                self.parts = list(list_parts(observation))
                 self.overlaps = self._find_deep(reader.read_overlaps())
         except reader.errors:
             return False
@@ -84,6 +92,7 @@ class WorldLog:
         self.states.append(states)
         self.touching.append(set(contacts))
         self.poses.append(poses)
+        self.points.append(points)
         self.observed.append(flatten(observation))
         self.given.append(action)
         self.before.append(reader.read_before())
@@ -156,8 +165,10 @@ class WorldLogger:
         moving = [world for world in self._worlds.values() if any(log.moves for log in world.logs)]
         return moving or list(self._worlds.values())
 
-    def play(self, number: int, kind: str, steps: int) -> None:
-        """Log an episode. If the environment raises, the log keeps what came before."""
+    def play(self, number: int, kind: str, steps: int, thrown: Collection[str] = ()) -> None:
+        """Log an episode. If the environment raises, the log keeps what came before. Free bodies of the names `thrown`
+        get another velocity every few steps."""
+        rng = np.random.default_rng(number)
         seed = FIRST_SEED + number
         logs: list[WorldLog] = []
         self._watch([])
@@ -170,8 +181,27 @@ class WorldLogger:
             if moment.step == 0:
                 self.calls.targets.clear()
             self._watch(logs)
+            if thrown and moment.step % THROWN_STEPS == 0:
+                for log in logs:
+                    _throw(log.reader, thrown, rng)
             if not logs:
                 return
+
+    def play_thrown(self, number: int, steps: int, thrown: Collection[str]) -> dict[int, WorldLog]:
+        """Return the logs of an episode in which free bodies are thrown, by the places of their worlds in `worlds`;
+        the worlds keep none."""
+        known = [(world, len(world.logs)) for world in self.worlds]
+        touched = {id(world): len(getattr(world.reader, "touched", ())) for world, _ in known}
+        with contextlib.suppress(EnvironmentRaised):  # such as where it ends without what was thrown
+            self.play(number, "random", steps, thrown)
+        logs: dict[int, WorldLog] = {}
+        for place, (world, count) in enumerate(known):
+            for log in world.logs[count:]:
+                logs[place] = log
+            del world.logs[count:]
+            if isinstance(world.reader, MujocoStateReader):
+                del world.reader.touched[touched[id(world)] :]
+        return logs
 
     def _watch(self, logs: list[WorldLog]) -> None:
         """Let readers remember the state before each step of the physics."""
@@ -248,6 +278,13 @@ class WorldLogger:
                 if not any(logged.gravity):
                     logged.weight_matters = logged.reader.weight_matters()
                 logged.jumps += logged.reader.find_jumps(FIRST_SEED + number)
+
+
+def _throw(reader: StateReader, names: Collection[str], rng: np.random.Generator) -> None:
+    bodies = [body for body in reader.world.bodies if body.name in names]
+    velocities = rng.uniform(THROWN[0], THROWN[1], size=(len(bodies), 6))
+    with contextlib.suppress(*reader.errors):
+        reader.throw(bodies, velocities)
 
 
 def name_place(place: Place) -> str:

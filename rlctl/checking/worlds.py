@@ -4,6 +4,7 @@ There are two readers: `bullet_worlds.BulletStateReader` and `mujoco_worlds.Mujo
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -23,6 +24,9 @@ Poses = dict[Link, Array]
 """By link: the position of its frame [m], its quaternion x, y, z, w, and the position of its centre of mass [m]. Shape
 (10,) each."""
 ORIENTATION = slice(3, 7)
+FRAME, CENTRE, TURN, LINEAR, TURNING = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 16)
+"""Where in a row of `StateReader.read_points` the position of its frame [m], that of its centre of mass [m], its
+quaternion x, y, z, w, and the velocity of its centre [m/s] and its angular velocity [rad/s] are, all in the world."""
 VELOCITY, ANGULAR, JOINTS = slice(3, 6), slice(6, 9), 9
 """Where in a body's state its base's velocity [m/s] and angular velocity [rad/s] are, after its position, and where its
 joints' begin: all positions, then all speeds [rad, rad/s; m, m/s]."""
@@ -137,6 +141,15 @@ class StateReader(Protocol):
 
     def read_poses(self) -> Poses:
         """Return the pose of each base that is free, and of each link of a robot."""
+
+    def name_points(self) -> list[str]:
+        """Name the rows of `read_points`."""
+
+    def read_points(self) -> Array:
+        """Return place and velocity of each link of a robot, each base that is free, and each site. Shape (n, 16)."""
+
+    def throw(self, bodies: Sequence[WorldBody], velocities: Array) -> None:
+        """Give free bodies velocities and angular velocities, shape (n, 6), in the environment's own simulation."""
 
     def read_before(self) -> tuple[list[Array], Poses] | None:
         """Return states and poses before the last call that advanced the physics; None where they are not known, or the

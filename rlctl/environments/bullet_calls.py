@@ -97,6 +97,19 @@ class ContactQuery:
     contacts: int = 0
 
 
+Contacts = tuple[tuple[Any, ...], ...]
+"""What getContactPoints returns."""
+ChangeContacts = Callable[[Sequence[Any], Contacts], Contacts]
+"""Returns other contacts for bodyA, bodyB, linkIndexA, linkIndexB and the client of a call, None where left out."""
+
+
+def _read_contact_arguments(arguments: Sequence[Any], keywords: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return bodyA, bodyB, linkIndexA and linkIndexB of a call; None where left out."""
+    names = ("bodyA", "bodyB", "linkIndexA", "linkIndexB")
+    named = {**dict(zip(names, arguments, strict=False)), **keywords}
+    return tuple(named.get(name) for name in names)
+
+
 class BulletCalls:
     """What was recorded."""
 
@@ -112,6 +125,7 @@ class BulletCalls:
         self.search_paths: list[str] = []
         self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
         self.after_step: Callable[[int], None] | None = None  # and after it
+        self.change_contacts: ChangeContacts | None = None  # what getContactPoints gives the environment instead
         self.steps: collections.Counter[int] = collections.Counter()  # calls of stepSimulation by client
         self._known: set[tuple[CodeType, int]] = set()
 
@@ -143,8 +157,7 @@ class BulletCalls:
                 self.late_links[call] = max(self.late_links.get(call, 0.0), math.dist(result[4], present))
             return
         if name == "getContactPoints":
-            names = ("bodyA", "bodyB", "linkIndexA", "linkIndexB")
-            one, two, link, other = ({**dict(zip(names, arguments, strict=False)), **keywords}.get(n) for n in names)
+            one, two, link, other = _read_contact_arguments(arguments, keywords)
             key = (call, client, one, two, link, other)
             bodies = tuple(-1 if body is None else int(body) for body in (one, two))
             query = self.queries.setdefault(key, ContactQuery(call, client, bodies, (link, other)))  # type: ignore[arg-type]
@@ -271,6 +284,9 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
                 calls.steps[client] += 1
                 if calls.after_step is not None:
                     calls.after_step(client)
+            if name == "getContactPoints" and calls.change_contacts is not None:
+                asked = (*_read_contact_arguments(arguments, keywords), int(keywords.get("physicsClientId", 0)))
+                return calls.change_contacts(asked, result or ())
             if name in with_results:
                 calls.note_result(name, frame, arguments, keywords, result)
             return result

@@ -1,5 +1,7 @@
 """Robots in MuJoCo with one mistake each, next to the twin that does the same thing right where it is not the robot."""
 
+import re
+
 import mujoco
 import numpy as np
 from mujoco_robots import ARM, HOPPER, MujocoArm, MujocoHopper
@@ -125,6 +127,33 @@ class ArmRange(MujocoArm):
 
 class RL810ArmRangeOfActuatorInDegrees(MujocoArm):
     xml = ARM.replace('ctrlrange="-1.04 2.61"', 'ctrlrange="-60 150"')
+
+
+class RL810ArmDrivesRangesInDegrees(MujocoArm):
+    """Its actions cover the ranges of the model, which are in degrees."""
+
+    rlctl_ignore = {"RL804": "a consequence", "RL805": "a consequence", "RL118": "a consequence"}
+    xml = re.sub('ctrlrange="[^"]*"', 'ctrlrange="-50 120"', ARM).replace('range="-20 140"', 'range="-60 140"')
+
+    def targets(self, action):
+        low, high = self.model.actuator_ctrlrange[self.motors].T
+        return low + (action + 1) / 2 * (high - low)
+
+
+class HopperHolds(MujocoHopper):
+    """Its actuators hold positions, and get targets."""
+
+    xml = HOPPER.replace("<motor ", '<position kp="30" ').replace('ctrlrange="-12 12"', 'ctrlrange="-1.5 1.5"')
+
+    def move(self, action):
+        self.data.ctrl[:] = self.home + 0.4 * action
+        mujoco.mj_step(self.model, self.data, nstep=self.frames)
+        self.forward()
+
+
+class RL810HopperRangesInDegrees(HopperHolds):
+    rlctl_ignore = {"RL706": "a consequence"}
+    xml = HopperHolds.xml.replace('ctrlrange="-1.5 1.5"', 'ctrlrange="-90 30"')
 
 
 class RL810ArmObservesRadiansOfRadians(MujocoArm):

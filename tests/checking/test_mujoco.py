@@ -32,6 +32,8 @@ CASES = [
     broken("RL810ArmDegrees", "RL810", "error", slow=True),
     broken("RL810ArmRangeInDegrees", "RL810", "error", "ArmRange", slow=True),
     broken("RL810ArmRangeOfActuatorInDegrees", "RL810", slow=True),
+    broken("RL810ArmDrivesRangesInDegrees", "RL810", "error", slow=True),
+    broken("RL810HopperRangesInDegrees", "RL810", twin="HopperHolds", slow=True),
     broken("RL810ArmObservesRadiansOfRadians", "RL810", "error", slow=True),
     broken("RL810HopperStartsInDegrees", "RL810", "error", slow=True),
     broken("RL811ArmOrder", "RL811", "error", slow=True),
@@ -101,13 +103,14 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
             ("left_hip, follows the position of joint left_knee",),
         ),
         ("joints.py:RL816ArmIncrementsTooFar", "RL816", ("ctrl[2] (bend)", "opposite action then changes nothing")),
-        ("joints.py:RL119HopperInDegrees", "RL119", ("joint left_hip in degrees", "is in rad/s")),
+        ("joints.py:RL119HopperInDegrees", "RL119", ("position of joint left_hip, in degrees", "57.3 times")),
         ("joints.py:RL819HopperSpeedsInOtherOrder", "RL819", ("the speeds of left_hip, right_hip",)),
         ("joints.py:RL820ArmVelocityOfSubsteps", "RL820", ("divided by 0.004 s", "5 times too large")),
         ("RL116HopperQuaternion", "RL116", ("of body", "(w, x, y, z) read as x, y, z, w")),
         ("RL811ArmOrder", "RL811", ("another order", "shoulder")),
         ("RL811HopperOrder", "RL811", ("right_knee", "left_knee", "not of its own joint")),
         ("RL810ArmRangeInDegrees", "RL810", ("were taken for degrees", "shoulder")),
+        ("RL810ArmDrivesRangesInDegrees", "RL810", ("turn is [-50, 120], in degrees (likewise lift, bend)",)),
         ("RL812HopperOtherSoles", "RL812", ("geom left_thigh",)),
         ("RL815ArmOldTip", "RL815", ("site_xpos of tip", "one substep old")),
         ("RL815ArmResetsWithoutForward", "RL815", ("of reset", "before mj_forward")),
@@ -159,3 +162,12 @@ def test_a_fix_names_the_calls_of_the_own_engine():
     assert "mj_forward" in finding.fix
     assert "getLinkState" not in finding.fix
     assert finding.name == "state is one step old"
+
+
+@pytest.mark.slow
+def test_fix_speaks_of_the_file_where_the_mistake_is():
+    (in_file,) = findings("broken_mujoco.py:RL810HopperRangesInDegrees", "RL810")
+    (in_code,) = findings("broken_mujoco.py:RL810ArmDegrees", "RL810")
+    assert "In the XML" in in_file.fix
+    assert "np.deg2rad" in in_code.fix
+    assert "(likewise" in in_code.message

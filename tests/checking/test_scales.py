@@ -59,8 +59,8 @@ def test_finds_the_mistake_and_only_that(case):
         ("RL706ArmOnePercent", "RL706", ("at most 0.43 %", "bend over [1.194, 1.206] of [-0.34, 2.44]")),
         ("RL625RoverOnePercent", "RL625", ("self.goal is 0.316 away", "(80 steps)")),
         ("RL624RoverTolerance", "RL624", ("false with self.goal 0.00158 away",)),  # its tolerance is 0.0015
-        ("RL119ArmCentimetres", "RL119", ("observation[6] follows self.goal times 100: centimetres",)),
-        ("RL119HopperCentimetres", "RL119", ("the position of body times 100",)),
+        ("RL119ArmCentimetres", "RL119", ("observation[6] is the position of site tip, in centimetres",)),
+        ("RL119HopperCentimetres", "RL119", ("the position of body, in centimetres", "100 times")),
     ],
 )
 def test_finding_names_what_is_wrong(name, rule, words):

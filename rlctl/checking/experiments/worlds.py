@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.checking.engine_values import EngineValues, ScaledValue, find_scaled
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance, describe_failure
 from rlctl.checking.joint_copies import JointCopy, find_copies
@@ -20,13 +21,15 @@ from rlctl.checking.readings import join_logs
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
 from rlctl.checking.world_logs import LoggedWorld, WorldLog, WorldLogger
-from rlctl.checking.worlds import Array
+from rlctl.checking.worlds import VELOCITY, Array
 from rlctl.environments.bullet_calls import BulletCalls, record_calls
 from rlctl.environments.bullet_clients import find_clients
 
 ENGINES = {"pybullet", "mujoco"}
 EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("random", 60)) + (("random", 2),) * 16
 """Actions and logged steps. The last ones are for what resets draw."""
+THROWN_EPISODES, THROWN_STEPS = (1, 2), 40  # in which free bodies are thrown that hardly moved
+STILL = 0.02  # standard deviation of a velocity [m/s]
 ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the experiment's time
 
 
@@ -43,6 +46,21 @@ class ObservedWorld:
         """The elements of the observation that are a copy of one value of one joint."""
         return find_copies(self.logs, self.observed)
 
+    def name_element(self, column: int) -> str:
+        """Return how to write an element of the observation: `observation[3]`, or `observation['velocity'][0]`."""
+        first = 0
+        for name, size in self.logs[0].parts:
+            if column < first + size:
+                return f"{name}[{column - first}]"
+            first += size
+        return f"observation[{column}]"
+
+    @functools.cached_property
+    def scaled(self) -> list[ScaledValue]:
+        """The elements of the observation that are a value of the engine times a factor, perhaps with noise."""
+        sizes = [len(log.observed) for log in self.logs]
+        return find_scaled(EngineValues.read(self.logs), self.observed, sizes)
+
 
 @dataclasses.dataclass(frozen=True)
 class WatchedWorlds:
@@ -54,6 +72,7 @@ class WatchedWorlds:
     mujoco_calls: MujocoCalls
     low: Array  # Of the action. Shape (n,)
     high: Array
+    logger: WorldLogger
 
     @functools.cached_property
     def driven(self) -> list[tuple[LoggedWorld, list[CommandSpan]]]:
@@ -67,6 +86,32 @@ class WatchedWorlds:
         """The worlds with enough observations to compare with what the engine has."""
         joined = [(world, join_logs(world)) for world in self.worlds]
         return [ObservedWorld(world, *both) for world, both in joined if both is not None]
+
+    @functools.cached_property
+    def thrown(self) -> list[ObservedWorld]:
+        """The worlds whose free bodies hardly moved, watched again while these are thrown."""
+        still = {name for world in self.worlds for name in _find_still(world)}
+        if not still or not self.instance.accepts_seed or self.instance.context.budget.is_over():
+            return []
+        played = [self.logger.play_thrown(number, THROWN_STEPS, still) for number in THROWN_EPISODES]
+        found = []
+        for place, world in enumerate(self.worlds):
+            logs = [logs[place] for logs in played if place in logs]
+            joined = join_logs(dataclasses.replace(world, logs=logs))
+            if joined is not None:
+                found.append(ObservedWorld(world, *joined))
+        return found
+
+
+def _find_still(world: LoggedWorld) -> set[str]:
+    """Return the names of free bodies without joints that hardly moved."""
+    fastest: dict[str, float] = {}
+    for log in world.logs:
+        for body, states in log.bodies:
+            if body.is_free and not body.joints:
+                speed = float(np.abs(states[:, VELOCITY]).std(axis=0).max())
+                fastest[body.name] = max(fastest.get(body.name, 0.0), speed)
+    return {name for name, speed in fastest.items() if speed < STILL}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +156,7 @@ def watch_worlds(context: Context) -> Iterator[ChildMessage]:
         yield from _log_episodes(logger, context)
         bounds = [leaf.flat_bounds for leaf in instance.action_leaves if leaf.supported]
         low, high = (np.concatenate([pair[end] for pair in bounds] or [np.zeros(0)]) for end in (0, 1))
-        watched = WatchedWorlds(instance, logger.worlds, calls, mujoco_calls, low, high)
+        watched = WatchedWorlds(instance, logger.worlds, calls, mujoco_calls, low, high, logger)
         for message in list(judges_worlds.judge(watched)):
             if isinstance(message, RuleFinding):
                 found.append(message.rule)

@@ -9,9 +9,9 @@ from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.joint_copies import DEGREES, JointCopy
 from rlctl.checking.motor_commands import CommandSpan
 from rlctl.checking.motor_targets import APART, DEGREE, ROUNDED, covers, read_first_targets
-from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
+from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names, list_others
 from rlctl.checking.world_logs import LoggedWorld
-from rlctl.checking.worlds import JOINTS, JointKey, MotorTarget
+from rlctl.checking.worlds import JOINTS, JointActuator, JointKey, MotorTarget
 from rlctl.environments.bullet_calls import FULL_TURN, BulletCalls
 
 RULE = Rule(
@@ -22,7 +22,8 @@ RULE = Rule(
         A position for a revolute joint is in degrees: it is outside its limits by more than three times their
         range and by more than a full turn, or it is the joint's position at reset as degrees, or the action
         covers the joint's range times 57.3 or divided by it. PyBullet and MuJoCo expect radians; the degrees of
-        a MuJoCo compiler are converted when the model is loaded, and model.jnt_range has radians.
+        a MuJoCo compiler are converted when the model is loaded, and model.jnt_range has radians. The ctrlrange of
+        a position actuator in the XML is not converted.
     """,
     fix="""
         Convert with np.deg2rad, and clip targets to the joint's limits; do not convert what is read from the
@@ -32,14 +33,23 @@ RULE = Rule(
 )
 
 FAR_RANGES = 3.0  # a target farther outside the limits is not just out of reach
+XML_FIX = (
+    "In the XML, write ctrlrange in radians, whatever its compiler's angle is: a joint's range is converted, ctrlrange "
+    'is not (inheritrange="1" takes the converted range). Both differ by gear; kp and kv are per radian.'
+)
 
 
 @judges_worlds(RULE)
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for world, spans in watched.driven:
         targets = find_targets_in_degrees(world, watched.calls)
-        yield from targets or _find_ctrlrange_in_degrees(world)
-        if not targets:
+        motors = _find_motors_in_degrees(world)
+        uses_range = any(_covers_input(span) for span in spans if span.motor in motors)
+        if motors:
+            yield _describe_ctrlranges(motors, Severity.ERROR if uses_range else Severity.WARNING)
+        if targets and not uses_range:
+            yield from targets
+        if not motors and not targets:
             yield from find_ranges_in_degrees(spans)
     for one in watched.observed:
         yield from _find_shrunk_copies(one.copies)
@@ -58,29 +68,60 @@ def _joints(world: LoggedWorld) -> dict[JointKey, tuple[str, bool, float, float]
 
 def _find_far_targets(world: LoggedWorld, calls: BulletCalls) -> Iterator[RuleFinding]:
     joints = _joints(world)
+    far: dict[str, tuple[MotorTarget, float, float]] = {}
     for key, target in _list_positions(world, calls):
         name, has_limits, low, high = joints.get(key, ("", False, 0.0, 0.0))
-        outside = max(low - target.value, target.value - high)
-        if has_limits and outside > FAR_RANGES * (high - low) and abs(target.value) > FULL_TURN:
-            limits = f"its limits are [{low:.3g}, {high:.3g}] rad: degrees?"
-            message = f"{target.giver} gives joint {name} the position {target.value:.4g} rad; {limits}"
-            evidence = {"element": name, "value": target.value, "expected": [low, high]}
-            yield RuleFinding(RULE, message, evidence, where=target.where)
-            return
+        if has_limits and _is_far(target.value, low, high):
+            far.setdefault(name, (target, low, high))
+    for name, (target, low, high) in list(far.items())[:1]:
+        limits = f"its limits are [{low:.3g}, {high:.3g}] rad: degrees?"
+        message = f"{target.giver} gives joint {name} the position {target.value:.4g} rad; {limits}"
+        evidence = {"element": name, "value": target.value, "expected": [low, high]}
+        yield RuleFinding(RULE, message + list_others(list(far)), evidence, where=target.where)
 
 
-def _find_ctrlrange_in_degrees(world: LoggedWorld) -> Iterator[RuleFinding]:
-    """Yield an actuator whose range is that of its joint in degrees: MuJoCo converts the joint's, and not the other."""
+def _is_far(value: float, low: float, high: float) -> bool:
+    """Say whether a position is so far outside of limits, and so many turns, that it can only be in degrees."""
+    return max(low - value, value - high) > FAR_RANGES * (high - low) and abs(value) > FULL_TURN
+
+
+def _find_motors_in_degrees(world: LoggedWorld) -> list[JointActuator]:
+    """Return the actuators whose range is that of their joint in degrees, or a part of it: MuJoCo converts the joint's
+    range, and not the other."""
+    motors = []
     for motor in world.world.motors:
         joint, width = motor.joint, motor.high - motor.low
-        if motor.holds_position and joint.is_angle and joint.has_limits and math.isfinite(width):
-            ends = np.sort(np.degrees([joint.low, joint.high]) * motor.gear)
-            if np.abs(ends - [motor.low, motor.high]).max() <= ROUNDED * width:
-                limits = f"the limits of joint {joint.name}, [{joint.low:.3g}, {joint.high:.3g}] rad, in degrees"
-                message = f"ctrlrange of actuator {motor.name} is [{motor.low:.4g}, {motor.high:.4g}]: {limits}"
-                evidence = {"element": motor.name, "value": [motor.low, motor.high]}
-                yield RuleFinding(RULE, message, {**evidence, "expected": [joint.low, joint.high]}, Severity.WARNING)
-                return
+        if not (motor.holds_position and joint.is_angle and joint.has_limits and math.isfinite(width)):
+            continue
+        limits = np.sort([joint.low * motor.gear, joint.high * motor.gear])
+        in_degrees = np.degrees(limits)
+        is_equal = np.abs(in_degrees - [motor.low, motor.high]).max() <= ROUNDED * width
+        is_inside = motor.low >= in_degrees[0] - ROUNDED * width and motor.high <= in_degrees[1] + ROUNDED * width
+        is_far = any(_is_far(end, *limits.tolist()) for end in (motor.low, motor.high))
+        if is_equal or (is_inside and is_far):
+            motors.append(motor)
+    return motors
+
+
+def _covers_input(span: CommandSpan) -> bool:
+    """Say whether actions cover the range that an actuator declares."""
+    motor = span.motor
+    ends = np.abs(np.subtract([span.low, span.high], [motor.low, motor.high]))
+    return bool(ends.max() <= ROUNDED * (motor.high - motor.low))
+
+
+def _describe_ctrlranges(motors: Sequence[JointActuator], severity: Severity) -> RuleFinding:
+    first, joint = motors[0], motors[0].joint
+    limits = f"the limits of joint {joint.name} are [{joint.low:.3g}, {joint.high:.3g}] rad"
+    others = list_others([motor.name for motor in motors], most=8)
+    message = f"ctrlrange of actuator {first.name} is [{first.low:.4g}, {first.high:.4g}], in degrees{others}; {limits}"
+    evidence = {
+        "element": first.name,
+        "elements": [motor.name for motor in motors][:8],
+        "value": [first.low, first.high],
+        "expected": [joint.low * first.gear, joint.high * first.gear],
+    }
+    return RuleFinding(RULE, message, evidence, severity, fix=XML_FIX)
 
 
 def _list_positions(world: LoggedWorld, calls: BulletCalls) -> Iterator[tuple[JointKey, MotorTarget]]:
@@ -138,5 +179,6 @@ def _find_shrunk_copies(copies: Sequence[JointCopy]) -> Iterator[RuleFinding]:
     shrunk = [copy for copy in copies if copy.is_scaled(1 / DEGREES) and not copy.is_speed]
     for copy in shrunk[:1]:
         name = f"observation[{copy.column}]"
-        message = f"{name} is {copy.name} times pi / 180: it was in radians already"
+        others = list_others([f"observation[{other.column}]" for other in shrunk])
+        message = f"{name} is {copy.name} times pi / 180{others}: it was in radians already"
         yield RuleFinding(RULE, message, {"element": name, "value": copy.joint.name, "expected": "radians"})

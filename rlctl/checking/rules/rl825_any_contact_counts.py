@@ -1,0 +1,282 @@
+"""RL825: any contact counts."""
+
+import collections
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
+from rlctl.checking.instance import EnvironmentRaised, Instance
+from rlctl.checking.mujoco_worlds import MujocoStateReader
+from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
+from rlctl.checking.values import find_numbers, flatten, list_parts
+from rlctl.checking.world_logs import LoggedWorld
+from rlctl.checking.worlds import Array, Link, Pair
+from rlctl.environments.bullet_calls import Contacts
+from rlctl.environments.info import find_mujoco
+
+RULE = Rule(
+    "RL825",
+    "any contact counts",
+    Severity.WARNING,
+    meaning="""
+        A flag of the observation, a part of the reward or an end of the episode depends on whether anything touches,
+        and something always does: feet on the ground, an object on the table. It never changes, whatever the robot
+        bumps into. The engine's contacts are left out, and replaced by others, to see it.
+    """,
+    fix="""
+        Ask for the pair that is meant: give bodyB, and links, to getContactPoints; in MuJoCo compare both geoms of
+        each data.contact with those that are meant, instead of data.ncon.
+    """,
+)
+
+RESTS = 0.8  # of all looks after a reset, in which two bodies touch
+OFTEN = 0.3  # of all looks, in which two of their links do
+SEEDS = (FIRST_SEED + 1, FIRST_SEED + 2)
+STEPS, FEWEST_STEPS = 15, 4  # of an episode with the zero action; those in which something rests
+LEAST_CHANGE = 1e-3  # of what contacts change
+SAME = 1e-6  # relative
+MOST_PARTS = 6  # bumps that are tried
+
+
+@dataclasses.dataclass(frozen=True)
+class _Played:
+    """What the steps of some episodes returned."""
+
+    names: list[str]
+    rows: list[list[Array]]  # by episode and step: observation, numbers of the info, reward and `terminated`
+    asked: list[list[bool]]  # by episode and step: whether the engine had a contact that was shown
+
+    def pair(self, other: "_Played") -> tuple[Array, Array] | None:
+        """Return the steps of both in which this one had contacts, shape (steps, columns) each; None for few, and where
+        the other one has other columns."""
+        pairs = [
+            (row, of_other)
+            for rows, asked, others in zip(self.rows, self.asked, other.rows, strict=True)
+            for row, is_asked, of_other in zip(rows, asked, others, strict=False)
+            if is_asked
+        ]
+        if len({row.shape for pair in pairs for row in pair}) != 1:
+            return None
+        first, second = np.array(pairs).transpose(1, 0, 2)
+        ended = any(row[-1] for row in first)
+        return (first, second) if ended or len(first) >= FEWEST_STEPS else None
+
+
+@judges_worlds(RULE, place=94)
+def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
+    if not watched.instance.accepts_seed or watched.instance.context.budget.is_over():
+        return
+    for world in watched.worlds:
+        resting = _find_resting(world)
+        is_asked = _asks_in_bullet(watched, world) or _asks_in_mujoco(watched, world)
+        bumps = _list_bumps(world, resting) if resting and is_asked else []
+        if isinstance(world.reader, MujocoStateReader):
+            bumps = [bump for bump in bumps if all(world.reader.find_geom(link) is not None for link in bump)]
+        if not bumps:
+            continue
+        try:
+            yield from _try_bumps(watched, world, resting, bumps)
+        except EnvironmentRaised:  # an episode that was logged raised it too, or it needs what is left out
+            return
+
+
+def _find_resting(world: LoggedWorld) -> set[Pair]:
+    """Return the pairs of links with which two bodies, or a body and itself, touch in nearly all looks: feet that take
+    turns, too. Without robots that hold something, and without what touches now and then."""
+    looks = [pairs for log in world.logs for pairs in log.touching[1:]]
+    robots = {body.id for body in world.world.bodies if body.joints}
+    free = {body.id for body in world.world.bodies if body.is_free}
+    links = collections.Counter(pair for pairs in looks for pair in pairs)
+    bodies = collections.Counter(both for pairs in looks for both in {_get_bodies(pair) for pair in pairs})
+    resting = set()
+    for pair, count in links.items():
+        both = _get_bodies(pair)
+        holds = len(both) == 2 and bool(both & robots) and both <= robots | free
+        if not holds and bodies[both] >= RESTS * len(looks) and count >= OFTEN * len(looks):
+            resting.add(pair)
+    return resting
+
+
+def _get_bodies(pair: Pair) -> frozenset[int]:
+    return frozenset(body for body, _ in pair)
+
+
+def _asks_in_bullet(watched: WatchedWorlds, world: LoggedWorld) -> bool:
+    """Say whether the environment asks PyBullet for contacts without naming both bodies, and gets some."""
+    for query in watched.calls.queries.values():
+        if query.client == world.world.client and query.contacts and -1 in query.bodies:
+            return True
+    return False
+
+
+def _asks_in_mujoco(watched: WatchedWorlds, world: LoggedWorld) -> bool:
+    return isinstance(world.reader, MujocoStateReader) and watched.mujoco_calls.reads_contacts
+
+
+def _list_bumps(world: LoggedWorld, resting: set[Pair]) -> list[tuple[Link, Link]]:
+    """Return pairs of links that do not touch, and that a bump may be of: the robot with what rests on something, and a
+    link of the robot that does not stand on anything with another body."""
+    bodies, touched = world.world.bodies, {link for pair in resting for link in pair}
+    robots = [body for body in bodies if body.joints] or [body for body in bodies if body.is_free]
+    bumps: list[tuple[Link, Link]] = []
+    for robot in robots:
+        links = [(robot.id, number - 1) for number in range(len(robot.links))]
+        idle = [link for link in reversed(links) if link not in touched]
+        mine = idle or links
+        others = [body for body in bodies if body.id != robot.id]
+        objects = [body for body in others if body.is_free and (body.id, -1) in touched]
+        statics = [body for body in others if not body.is_free and not body.joints]
+        away = [body for body in statics if (body.id, -1) not in touched]
+        for other in [*objects, *away, *(statics if idle else [])]:
+            bumps.append((mine[0], (other.id, -1)))
+    return bumps[:MOST_PARTS]
+
+
+def _try_bumps(
+    watched: WatchedWorlds, world: LoggedWorld, resting: set[Pair], bumps: Sequence[tuple[Link, Link]]
+) -> Iterator[RuleFinding]:
+    """Yield what is the same with the contacts that are always there and with a bump, and differs without contacts."""
+    play = _play_in_mujoco if isinstance(world.reader, MujocoStateReader) else _play_in_bullet
+    standing = play(watched, world, resting, None)
+    again = play(watched, world, resting, None)
+    changed = _find_constant(standing, play(watched, world, set(), None), again)
+    for bump in bumps if changed else ():
+        bumped = play(watched, world, set(), bump)
+        same = [column for column in changed if _is_same(standing, bumped, again, column)]
+        if same:
+            yield _describe(world, resting, bump, [(standing.names[column], changed[column]) for column in same])
+            return
+
+
+def _describe(
+    world: LoggedWorld, resting: set[Pair], bump: tuple[Link, Link], found: Sequence[tuple[str, float]]
+) -> RuleFinding:
+    name = world.world.link_name
+    pairs = sorted(resting, key=lambda pair: (pair[0][0] == pair[1][0], pair))
+    stands = list_names([f"{name(max(pair))} on {name(min(pair))}" for pair in pairs], 3)
+    what = list_names([text for text, _ in found], 4)
+    change = f"{found[0][0]} differs by {found[0][1]:.4g}" if len(found) > 1 else f"it differs by {found[0][1]:.4g}"
+    always = f"there is nearly always one ({stands}), and without any contact {change}"
+    message = (
+        f"{what} counts any contact: {always}; a contact of {name(bump[0])} with {name(bump[1])} alone is the same"
+    )
+    return RuleFinding(RULE, message, {"element": found[0][0], "elements": [text for text, _ in found][:8]})
+
+
+def _find_constant(standing: _Played, without: _Played, again: _Played) -> dict[int, float]:
+    """Return the columns in which all steps differ by the same amount without contacts, and the amount."""
+    pairs, repeated = standing.pair(without), standing.pair(again)
+    if pairs is None or repeated is None:
+        return {}
+    noise = np.abs(repeated[0] - repeated[1]).max(axis=0)
+    differences = pairs[0] - pairs[1]
+    size = np.abs(differences).min(axis=0)
+    is_constant = np.ptp(differences, axis=0) <= 10 * noise + SAME * (1 + np.abs(pairs[0]).max(axis=0))
+    columns = np.flatnonzero(is_constant & (size > np.maximum(LEAST_CHANGE, 20 * noise)))
+    return {column: float(size[column]) for column in columns.tolist()}
+
+
+def _is_same(standing: _Played, bumped: _Played, again: _Played, column: int) -> bool:
+    pairs, repeated = standing.pair(bumped), standing.pair(again)
+    if pairs is None or repeated is None:
+        return False
+    noise = np.abs(repeated[0] - repeated[1]).max(axis=0)[column]
+    off = np.abs(pairs[0] - pairs[1])[:, column].max()
+    return bool(off <= 10 * noise + SAME * (1 + np.abs(pairs[0][:, column]).max()))
+
+
+def _play(instance: Instance, shown: Callable[[], bool]) -> _Played:
+    """Play episodes; `shown` says whether there were contacts since it was called last."""
+    played = _Played([], [], [])
+    for seed in SEEDS:
+        played.rows.append([])
+        played.asked.append([])
+        for moment in EpisodePlayer(instance, seed, "zero", max_steps=STEPS):
+            is_shown = shown()
+            if moment.step == 0:
+                continue
+            info = dict(find_numbers(moment.info)) if isinstance(moment.info, dict) else {}
+            observed = np.nan_to_num(flatten(moment.observation).astype(np.float64))
+            numbers = np.nan_to_num([*info.values(), moment.reward_number, float(moment.flags[0])])
+            played.rows[-1].append(np.concatenate([observed, numbers]))
+            played.asked[-1].append(is_shown)
+            if not played.names:
+                parts = list_parts(moment.observation)
+                played.names.extend(f"{name}[{number}]" for name, size in parts for number in range(size))
+                played.names.extend([*(f"info[{name!r}]" for name in info), "the reward", "the end of the episode"])
+    return played
+
+
+def _play_in_bullet(
+    watched: WatchedWorlds, world: LoggedWorld, kept: set[Pair], bump: tuple[Link, Link] | None
+) -> _Played:
+    client, was_shown = world.world.client, False
+
+    def change(asked: Sequence[int | None], contacts: Contacts) -> Contacts:
+        nonlocal was_shown
+        if asked[4] != client:
+            return contacts
+        links = [((contact[1], contact[3]), (contact[2], contact[4])) for contact in contacts]
+        pairs = zip(contacts, links, strict=True)
+        shown = [contact for contact, pair in pairs if pair in kept or pair[::-1] in kept]
+        shown += _make_contacts(asked, bump) if bump is not None else ()
+        was_shown |= bool(shown)
+        return tuple(shown)
+
+    def read_shown() -> bool:
+        nonlocal was_shown
+        is_shown, was_shown = was_shown, False
+        return is_shown
+
+    watched.calls.change_contacts = change
+    try:
+        return _play(watched.instance, read_shown)
+    finally:
+        watched.calls.change_contacts = None
+
+
+def _make_contacts(asked: Sequence[int | None], bump: tuple[Link, Link]) -> Iterator[tuple[Any, ...]]:
+    """Yield a contact as getContactPoints returns it, if it has the bodies and links that are asked for."""
+    nothing = (0.0, 0.0, 0.0)
+    for one, two in (bump, bump[::-1]):
+        given = (one[0], two[0], one[1], two[1])
+        if all(wanted in (None, value) for wanted, value in zip(asked, given, strict=False)):
+            yield (0, *given, nothing, nothing, (0.0, 0.0, 1.0), -1e-3, 10.0, 0.0, nothing, 0.0, nothing)
+            return
+
+
+def _play_in_mujoco(
+    watched: WatchedWorlds, world: LoggedWorld, kept: set[Pair], bump: tuple[Link, Link] | None
+) -> _Played:
+    simulation, reader = find_mujoco(watched.instance.env), world.reader
+    assert simulation is not None  # it was logged
+    assert isinstance(reader, MujocoStateReader)
+    geoms = [] if bump is None else [reader.find_geom(link) for link in bump]
+    data_of_env, was_shown = simulation[1], False
+
+    def change(_: Any, data: Any) -> None:
+        nonlocal was_shown
+        if data is not data_of_env or not data.ncon:
+            return
+        pairs = data.contact.geom.copy()
+        links = [(reader.find_link(one), reader.find_link(two)) for one, two in pairs.tolist()]
+        shown = pairs[[pair in kept or pair[::-1] in kept for pair in links]]
+        if geoms:
+            shown = np.array([geoms])
+        was_shown = bool(len(shown))
+        data.ncon = len(shown)  # of the contacts that are there, whose forces stay
+        if was_shown:
+            data.contact.geom[:] = shown
+            data.contact.geom1[:], data.contact.geom2[:] = shown.T
+
+    calls = watched.mujoco_calls
+    calls.after_step, calls.after_forward = change, change
+    try:
+        return _play(watched.instance, lambda: was_shown)
+    finally:
+        calls.after_step, calls.after_forward = type(calls).after_step, type(calls).after_forward
