@@ -8,8 +8,7 @@ from tests.checking.judging import case, check_case, findings, mark_slow
 pytest.importorskip("mujoco")
 
 
-def broken(name, twin, **settings):
-    file = "broken_progress.py"
+def broken(name, twin, file="broken_progress.py", **settings):
     return case(f"{file}:{name}", (name[:5], "warning"), twin=f"{file}:{twin}", **settings)
 
 
@@ -22,6 +21,9 @@ CASES = [
     broken("RL622FlyerCostsSuccess", "FlyerPaysSuccess", slow=True),
     broken("RL622CartCostsSuccess", "CartPaysSuccess", slow=True),
     broken("RL622PuckCostsSuccess", "PuckPaysSuccess", pybullet=True, slow=True),
+    broken("RL622RoverTurnsAway", "RoverTurns", file="broken_headings.py"),
+    broken("RL622DroneTurnsAway", "DroneTurns", file="broken_headings.py", slow=True),
+    broken("RL622DialTurnsAway", "Dial", file="broken_headings.py", slow=True),
     broken("RL125CartTurnsBack", "CartSeeks", slow=True),
     broken("RL125FlyerTurnsBack", "FlyerSeeks", slow=True),
     broken("RL125HopperTurnsBack", "HopperSeeks", slow=True),

@@ -41,6 +41,9 @@ Source = tuple[int, int]
 by itself, and `TURNED` for the way to the goal in the frame of a robot that turns."""
 TURNED = 2
 TURN_SHIFT, TURN_ERROR = 0.1, 1e-3  # of a goal along each axis, to see how the observation turns it
+TURNS = (2 * np.pi, 360.0)  # one turn [rad, deg]
+TURNED_STEPS = 2  # with the goal a turn further: of the first, progress is the way of the goal too
+SAME_REWARD = 1e-5  # of the rewards, or of 1: what float32 makes of an angle and of another a turn further
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,6 +139,34 @@ class GoalTrials:
     def range(self) -> Numbers:
         """How far the goals lie apart. Shape (size,)."""
         return np.asarray(np.ptp(self.goals, axis=0))
+
+    @functools.cached_property
+    def turns(self) -> Numbers:
+        """How long a turn is along each axis that is an angle, after which the same is paid again; infinite along the
+        others. Only axes are tried of which the goals cover more than half a turn. Shape (size,)."""
+        turns = np.full(self.range.shape, np.inf)
+        for axis, covered in enumerate(self.range):
+            for turn in TURNS:
+                if covered > turn / 2 and self._repeats(axis, turn):
+                    turns[axis] = turn
+                    break
+        return turns
+
+    def _repeats(self, axis: int, turn: float) -> bool:
+        """Say whether goals pay the same that are a turn apart, and others do not."""
+        for seed in (FIRST_SEED, SECOND_SEED):
+            goal = GoalEpisode(self, seed).goal
+            # To the other side of zero: some rewards add or subtract one turn only.
+            way = -np.copysign(turn, goal[axis]) * np.eye(goal.size)[axis]
+            here, quarter, whole = (self._pay(seed, goal + part * way) for part in (0.0, 0.25, 1.0))
+            if not _is_same(here, whole) or _is_same(here, quarter):
+                return False
+        return True
+
+    def _pay(self, seed: int, goal: Numbers) -> Numbers:
+        """Return what some later steps pay with a goal; fewer where the episode ends. Shape (steps,)."""
+        episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
+        return np.array([step.reward for step in episode.play([goal] * TURNED_STEPS)])
 
     @functools.cached_property
     def at_goal(self) -> "AtGoal":
@@ -275,6 +306,10 @@ class GoalEpisode:
             if self.has_ended:
                 break
             yield self.step(goal)
+
+
+def _is_same(one: Numbers, two: Numbers) -> bool:
+    return one.shape == two.shape and np.allclose(one, two, rtol=SAME_REWARD, atol=SAME_REWARD)
 
 
 def _read_success(moment: Moment) -> bool | None:

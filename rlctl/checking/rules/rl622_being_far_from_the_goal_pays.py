@@ -41,6 +41,7 @@ FEWEST_MOVED = 0.02  # part of the goals' range: how far apart the robot is in t
 RADII = (0.35, 0.7, 1.0)  # parts of the goals' range
 WAY_RADIUS, WAY = 0.7, 0.2
 """Parts of the goals' range, at which a goal is that comes nearer or goes away in a step, and of this distance."""
+MOST_TURN = 0.45  # part of a turn: an angle that is further away is nearer on the other side
 LEAST = 1e-6  # differences of rewards that count, of their size
 
 
@@ -124,7 +125,7 @@ def _find_axes(
 
 def _describe_distance(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float]) -> RuleFinding:
     near, *_, far = shown
-    lengths = " and ".join(f"{radius * trials.range[axes[0]]:.3g}" for radius in (RADII[0], RADII[-1]))
+    lengths = " and ".join(f"{radius * _find_room(trials, axes[0]):.3g}" for radius in (RADII[0], RADII[-1]))
     rises = f"the reward rises with the distance to the goal ({_name_axes(trials, axes)})"
     if far <= near:
         rises = f"the reward is larger at any distance to the goal ({_name_axes(trials, axes)}) than at the goal"
@@ -135,7 +136,7 @@ def _describe_distance(trials: GoalTrials, axes: Sequence[int], shown: Sequence[
 
 def _describe_way(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float]) -> RuleFinding:
     near, far = shown
-    way = f"{WAY * WAY_RADIUS * trials.range[axes[0]]:.3g}"
+    way = f"{WAY * WAY_RADIUS * _find_room(trials, axes[0]):.3g}"
     comes = f"the reward is {near:.4g} where the goal ({_name_axes(trials, axes)}) comes {way} nearer in a step"
     message = f"{comes}, and {far:.4g} where it goes as far away"
     evidence = {"element": trials.drawn.name, "value": far, "expected": f"below {near:.6g}"}
@@ -191,7 +192,7 @@ def _measure_sides(trials: GoalTrials, source: Source, number: int, axis: int, i
         outside = []
         for radius in RADII:
             offsets = np.zeros((LATER_STEPS, trials.goals.shape[1]))
-            offsets[:, axis] = sign * radius * trials.range[axis]
+            offsets[:, axis] = sign * radius * _find_room(trials, axis)
             outcome = _measure(trials, source, number, offsets)
             if outcome is None or outcome.succeeds or outcome.has_ended:
                 return ()
@@ -210,7 +211,7 @@ def _measure_ways(trials: GoalTrials, source: Source, number: int, axis: int, _:
         rewards = []
         for change in (-WAY, WAY):
             offsets = np.zeros((LATER_STEPS, trials.goals.shape[1]))
-            offsets[:, axis] = sign * WAY_RADIUS * trials.range[axis]
+            offsets[:, axis] = sign * WAY_RADIUS * _find_room(trials, axis)
             offsets[-1] *= 1 + change
             outcome = _measure(trials, source, number, offsets)
             if outcome is None or outcome.succeeds or outcome.has_ended:
@@ -220,6 +221,11 @@ def _measure_ways(trials: GoalTrials, source: Source, number: int, axis: int, _:
             return ()
         shown = rewards
     return shown
+
+
+def _find_room(trials: GoalTrials, axis: int) -> float:
+    """Return how far from the robot a goal may be put along an axis."""
+    return float(min(trials.range[axis], MOST_TURN * trials.turns[axis]))
 
 
 def _rises(rewards: Sequence[float]) -> bool:
