@@ -132,12 +132,11 @@ def read_contacts(client: int) -> dict[Pair, float]:
 
 
 def read_overlaps(world: World) -> dict[Pair, float]:
-    """Return the deepest distance per pair of links that are inside each other, of each free body and what else moves;
-    the engine may not have looked for contacts since the bodies were placed."""
+    """Return the deepest distance per pair of links that are inside each other, of each free body and any other; the
+    engine may not have looked for contacts since the bodies were placed."""
     p = ClientCalls(world.client)
-    moving = [body for body in world.bodies if body.is_free or body.joints]
     deepest: dict[Pair, float] = {}
-    for one, two in itertools.combinations(moving, 2):
+    for one, two in itertools.combinations(world.bodies, 2):
         for point in p.getClosestPoints(one.id, two.id, 0.0) if one.is_free or two.is_free else ():
             pair = (one.id, point[3]), (two.id, point[4])
             deepest[pair] = min(deepest.get(pair, 0.0), point[8])

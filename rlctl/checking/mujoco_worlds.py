@@ -268,10 +268,8 @@ class MujocoStateReader:
     def read_overlaps(self) -> dict[Pair, float]:
         """See `StateReader`."""
         free = {body.id for body in self.world.bodies if body.is_free}
-        moving = free | {body.id for body in self.world.bodies if body.joints}
         overlaps = {pair: distance for pair, distance in self.read_contacts().items() if distance < 0.0}
-        bodies = {pair: {root for root, _ in pair} for pair in overlaps}
-        return {pair: overlaps[pair] for pair in overlaps if bodies[pair] <= moving and bodies[pair] & free}
+        return {pair: overlaps[pair] for pair in overlaps if {root for root, _ in pair} & free}
 
     def find_thickness(self, pair: Pair) -> float:
         """See `StateReader`."""

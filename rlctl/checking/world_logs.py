@@ -58,7 +58,7 @@ class WorldLog:
     states: list[list[Array]] = dataclasses.field(default_factory=list)  # by look and body
     deep: list[dict[Pair, tuple[float, float]]] = dataclasses.field(default_factory=list)  # depth and limit [m]
     overlaps: dict[Pair, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """Depth and limit [m] of free bodies that a reset puts into what moves."""
+    """Depth and limit [m] of free bodies that a reset puts into others."""
     touching: list[set[Pair]] = dataclasses.field(default_factory=list)  # Links that touch
     poses: list[Poses] = dataclasses.field(default_factory=list)
     points: list[Array] = dataclasses.field(default_factory=list)  # see `StateReader.read_points`

@@ -159,8 +159,8 @@ class StateReader(Protocol):
         """Return the deepest distance per pair of links that touch [m]; below zero they are inside each other."""
 
     def read_overlaps(self) -> dict[Pair, float]:
-        """Return the deepest distance per pair of links that are inside each other [m], of a free body and what else
-        moves, also right after they were placed."""
+        """Return the deepest distance per pair of links that are inside each other [m], of a free body and another one,
+        also right after they were placed."""
 
     def find_thickness(self, pair: Pair) -> float:
         """Return the smallest extent of the thinner of two links [m]."""

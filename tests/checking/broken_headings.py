@@ -11,11 +11,13 @@ DIAL = """
   <geom type="cylinder" size=".1 .02" mass=".5"/><geom type="box" pos=".08 0 0" size=".02 .01 .03" mass=".05"/>
 </body></worldbody><actuator><motor joint="dial" ctrlrange="-1 1" gear=".2"/></actuator></mujoco>
 """
+WRAPS = {"RL117": "the goal is an angle too"}
 
 
 class RoverTurns(Rover):
     """The goal is the heading [rad]."""
 
+    rlctl_ignore = WRAPS
     limit = 40
 
     def draw_goal(self):
@@ -53,7 +55,7 @@ class DroneTurns(RoverTurns, Drone):
         Drone.move(self, action)
 
     def observe(self):
-        return np.array([np.rad2deg(self.pitch), self.rate, self.goal], np.float32)
+        return np.array([np.rad2deg(self.pitch), self.rate, self.goal, *self.speed], np.float32)
 
     def distance(self):
         error = abs(np.rad2deg(self.pitch) - self.goal)
@@ -71,6 +73,7 @@ class RL622DroneTurnsAway(DroneTurns):
 class Dial(MujocoRobot):
     """A dial without stops, which may turn many times."""
 
+    rlctl_ignore = WRAPS
     xml, joints, goal = DIAL, 1, 0.0
 
     def start(self):

@@ -24,6 +24,14 @@ CASES = [
     ),
     case("broken_physics.py:RL805Explodes", ("RL805", "warning"), twin=CART, slow=True),
     case("broken_physics.py:RL813LongPhysicsSteps", ("RL813", "warning"), twin=CART, slow=True),
+    *(
+        case(f"broken_overlaps.py:{name}", ("RL803", "warning"), twin=twin, pybullet=True, slow=True)
+        for name, twin in (
+            ("RL803PusherSinksItsCube", "robots.py:Pusher"),
+            ("RL803CrawlerSinks", "robots.py:Crawler"),
+            ("RL803ArmSinksItsCube", "broken_overlaps.py:ArmAboveCube"),
+        )
+    ),
     case("broken_physics.py:RL807StartsInTheFloor", ("RL807", "warning"), twin=CART, slow=True),
     case("broken_models.py:RL809HeavyInertia", ("RL809", "warning"), twin="broken_models.py:CartTask", slow=True),
     case("broken_models.py:RL809TipWithoutInertial", ("RL809", "info"), twin="broken_models.py:CartTask", slow=True),

@@ -83,6 +83,20 @@ CASES = [
     case("broken_goals.py:RL614OneByOne", ("RL614", "error"), twin="broken_goals.py:RL614RoundedReward"),
     case("broken_goals.py:RL614NanComputed", ("RL614", "error")),
     case("broken_goals.py:RL614NumberlessReward", ("RL614", "error"), twin="broken_goals.py:RL614NestedGoal"),
+    case("broken_hindsight.py:RL614RoverOwnGoal", ("RL614", "error"), twin="broken_hindsight.py:RL614RoverSeeks"),
+    case(
+        "broken_hindsight.py:RL614ArmOwnGoal",
+        ("RL614", "error"),
+        twin="broken_hindsight.py:RL614ArmSparse",
+        slow=True,
+    ),
+    case(
+        "broken_hindsight.py:RL614ReacherOwnGoal",
+        ("RL614", "error"),
+        twin="broken_hindsight.py:RL614ReacherSeeks",
+        pybullet=True,
+        slow=True,
+    ),
 ]
 
 

@@ -1,12 +1,15 @@
 """RL614: hindsight reward differs."""
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
-from rlctl.checking.instance import Context, EnvironmentRaised
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 
@@ -15,18 +18,23 @@ RULE = Rule(
     "hindsight reward differs",
     Severity.ERROR,
     meaning="""
-        compute_reward gives another reward than step did, or cannot take many goals at once. Hindsight
-        experience replay (HER) takes most of its rewards from there, and so learns another task.
+        compute_reward gives another reward than step did, cannot take many goals at once, or gives the same
+        whatever desired_goal it is asked for, as where it reads the environment's own goal. Hindsight experience
+        replay (HER) takes most of its rewards from there, and so learns another task.
     """,
     fix="""
         Let step() return float(self.compute_reward(achieved_goal, desired_goal, info)), and write
-        compute_reward for arrays: -np.linalg.norm(achieved_goal - desired_goal, axis=-1).
+        compute_reward for arrays, of its arguments only:
+        -np.linalg.norm(achieved_goal - desired_goal, axis=-1).
     """,
 )
 
 STEPS = 50
 TOLERANCE = 1e-4  # relative to the reward or to 1: rounding to float32
 GOALS = ("achieved_goal", "desired_goal")
+LEAST = 1e-9  # differences of rewards that count, relative to the reward or to 1
+RESETS = 6  # that draw other goals to ask for
+Rows = NDArray[Any]
 
 
 @experiment("hindsight", PROBE, 90, RULE, share=0.3)
@@ -47,8 +55,9 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
         infos = np.array([moment.info for moment in taken])
     except (LookupError, TypeError, ValueError):
         raise NotJudged("goals are missing or change their shape (RL101), or types are wrong (RL204)") from None
+    ask = functools.partial(_ask, instance, compute)
     try:
-        computed = instance.call("compute_reward", lambda: np.asarray(compute(*goals, infos), np.float64))
+        computed = ask(*goals, infos)
     except EnvironmentRaised as error:
         message = f"compute_reward, of many goals at once, raises {error}"
         yield RuleFinding(RULE, message, {"steps": len(taken)})
@@ -66,3 +75,36 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
         message = f"the reward of step {step + 1} is {rewards[step]:.6g}, and {returned}"
         evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(rewards[step])}
         yield RuleFinding(RULE, message, evidence)
+    else:
+        yield from _find_ignored_goal(instance, ask, goals[0], infos)
+
+
+def _ask(instance: Instance, compute: Callable[..., Any], achieved: Rows, desired: Rows, infos: Rows) -> Rows:
+    return np.asarray(
+        instance.call("compute_reward", lambda: np.asarray(compute(achieved, desired, infos), np.float64))
+    )
+
+
+def _find_ignored_goal(
+    instance: Instance, ask: Callable[..., Rows], achieved: Rows, infos: Rows
+) -> Iterator[RuleFinding]:
+    """Ask for the rewards of single steps with many goals: those that resets draw, and all that were achieved, as
+    hindsight replay does."""
+    desired = np.concatenate([achieved, _draw_goals(instance)])
+    if (desired == desired[0]).all():
+        return
+    for row in (len(achieved) // 2, len(achieved) - 1):
+        same = [row] * len(desired)
+        rewards = ask(achieved[same], desired, infos[same])
+        if rewards.shape != (len(desired),) or np.ptp(rewards) > LEAST * max(1.0, abs(rewards[0])):
+            return
+    message = f"compute_reward does not depend on desired_goal: the reward of step {row + 1} is {rewards[0]:.6g}"
+    message += f" with each of {len(desired)} goals, also with what was achieved"
+    yield RuleFinding(RULE, message, {"element": "desired_goal", "step": row + 1, "value": float(rewards[0])})
+
+
+def _draw_goals(instance: Instance) -> Rows:
+    """Return the goals that other seeds draw. Shape (RESETS, *goal)."""
+    seeds = range(FIRST_SEED + 1, FIRST_SEED + 1 + RESETS)
+    starts = [EpisodePlayer(instance, seed, max_steps=0).reset() for seed in seeds]
+    return np.stack([np.asarray(start.observation["desired_goal"]) for start in starts])
