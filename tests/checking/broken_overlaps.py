@@ -20,7 +20,9 @@ class RL803CrawlerSinks(Crawler):
     def start(self):
         super().start()
         place, turn = p.getBasePositionAndOrientation(self.robot, physicsClientId=self.client)
-        p.resetBasePositionAndOrientation(self.robot, np.subtract(place, [0, 0, 0.05]), turn, physicsClientId=self.client)
+        p.resetBasePositionAndOrientation(
+            self.robot, np.subtract(place, [0, 0, 0.05]), turn, physicsClientId=self.client
+        )
 
 
 class ArmAboveCube(MujocoArm):

@@ -59,6 +59,15 @@ CASES = [
     case("broken_repeats.py:RL302NoisyStep", ("RL302", "error"), ("RL309", "warning")),
     case("broken_repeats.py:RL303LeakyReset", ("RL303", "error")),
     case("broken_repeats.py:RL304ClassCounter", ("RL304", "error"), slow=True),
+    *(
+        case(f"broken_unseeded.py:{name}", ("RL312", "warning"), twin=twin, **settings)
+        for name, twin, settings in (
+            ("RL312BoatSeedsWithZero", "robots.py:Boat", {"pybullet": True}),
+            ("RL312DroneSeedsAgain", "broken_meaning.py:Drone", {"pybullet": True, "slow": True}),
+            ("RL312ArmSeedsWithZero", "mujoco_robots.py:MujocoArm", {"pybullet": True, "slow": True}),
+            ("RL312PusherSeedsAgain", "robots.py:Pusher", {"pybullet": True, "slow": True}),
+        )
+    ),
     case("broken_repeats.py:RL306FixedStart", ("RL306", "info"), slow=True),
     case("broken_repeats.py:RL308UnseededLater", ("RL308", "warning")),
     case("broken_repeats.py:RL301OldActionsAsRegistered", ("RL301", "error")),
