@@ -65,7 +65,8 @@ def find_kept(untouched: StateAfterReset, clean: StateAfterReset, dirty: StateAf
     """
     every_time = find_unequal(untouched.parts, clean.parts)
     names = find_unequal(clean.parts, dirty.parts)
-    names = [name for name in names if name not in every_time] or names
+    # A property of the model that every reset changes is no clock: it decides how everything moves.
+    names = [name for name in names if name not in every_time or _is_property(name)] or names
     return [KeptState(name, dirty.engines.get(name, ""), _find_observed(name, clean, dirty)) for name in names]
 
 
@@ -75,13 +76,19 @@ def describe_kept(kept: Sequence[KeptState], element: tuple[int, int] | None, el
     What the element shows that differs comes first, then what others show. The element is given as in
     `KeptState.observed`; None if the difference came later than at the reset.
     """
-    ranked = sorted(kept, key=lambda one: (element not in one.observed, not one.observed, one.name))
+    ranked = sorted(
+        kept, key=lambda one: (element not in one.observed, not one.observed, not _is_property(one.name), one.name)
+    )
     if not ranked:
         return "", "Set back in reset: every attribute that step changes, and the whole simulation."
     names = list_names([one.name for one in ranked], MOST_NAMES)
     shown = ranked[0].observed.get(element) if element is not None else None
     source = f"; {element_name} is {shown}" if shown is not None else ""
     return f" ({names}){source}", f"Set back in reset: {names}.{_name_calls(ranked)}"
+
+
+def _is_property(name: str) -> bool:
+    return name.startswith("model.")
 
 
 def _name_calls(kept: Sequence[KeptState]) -> str:

@@ -4,7 +4,7 @@ import re
 
 import mujoco
 import numpy as np
-from mujoco_robots import ARM, HOPPER, MujocoArm, MujocoHopper
+from mujoco_robots import ARM, HOPPER, SIDES, MujocoArm, MujocoHopper
 from scipy.spatial.transform import Rotation
 
 # RL116
@@ -471,3 +471,39 @@ class ArmKeepsMocap(MujocoArm):
 
     def observe(self):
         return np.append(super().observe(), self.data.mocap_pos)
+
+
+class HopperFeels(MujocoHopper):
+    """A foot touches the ground where a force of more than 2 N acts on it."""
+
+    def touches(self):
+        self.compute_forces()
+        feet = [self.model.body(f"{side}_foot").id for side in SIDES]
+        return np.linalg.norm(self.data.cfrc_ext[feet, 3:], axis=1) > 2.0
+
+    def compute_forces(self):
+        mujoco.mj_rnePostConstraint(self.model, self.data)
+
+
+class RL818HopperFeelsNothing(HopperFeels):
+    rlctl_ignore = {"RL110": "a consequence"}
+
+    def compute_forces(self):
+        pass
+
+
+class ArmFeels(MujocoArm):
+    """Pays for a hard blow against its hand."""
+
+    def reward(self):
+        self.compute_forces()
+        force = np.linalg.norm(self.data.cfrc_int[self.model.body("hand").id, 3:])
+        return super().reward() - 0.5 * (force > 20.0)
+
+    def compute_forces(self):
+        mujoco.mj_rnePostConstraint(self.model, self.data)
+
+
+class RL818ArmFeelsNothing(ArmFeels):
+    def compute_forces(self):
+        pass

@@ -22,6 +22,11 @@ CASES = [
     case("broken_robots.py:RL701ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
     case("broken_robots.py:RL701BoatForwardOnly", ("RL701", "info"), twin="robots.py:Boat"),
 ]
+CASES += [
+    case(f"broken_maps.py:RL707{robot}FallsBack", ("RL707", "warning"), twin=twin, pybullet=True, slow=robot != "Rover")
+    for robot in ("Rover", "Drone", "Arm", "Crawler")
+    for twin in (f"broken_maps.py:RL707{robot}Switches",)
+]
 CLEAN = [f"{FILE}:RL701Switch"]
 
 

@@ -55,6 +55,8 @@ CASES = [
     broken("RL301HopperKeepsTime", "RL301", "error", "RL301HopperResets", slow=True),
     broken("RL818ArmInverse", "RL818", twin="RL818ArmActuator", slow=True),
     broken("RL818HopperForces", "RL818", twin="RL818HopperRightForces", slow=True),
+    broken("RL818HopperFeelsNothing", "RL818", twin="HopperFeels", slow=True),
+    broken("RL818ArmFeelsNothing", "RL818", twin="ArmFeels", slow=True),
     case(
         "broken_mujoco_joints.py:RL804ArmLimitsInRadians",
         ("RL804", "warning"),

@@ -7,8 +7,9 @@ import numpy as np
 
 from rlctl.checking import rewards
 from rlctl.checking.episode import zero_action
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
-from rlctl.checking.records import CheckedEpisode, ChildMessage, Skipped
+from rlctl.checking.records import CheckedEpisode, ChildMessage, Records, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -18,7 +19,8 @@ RULE = Rule(
     meaning="""
         The goal ends the episode, and with it a positive reward per step: stopping just before the goal and
         staying there earns more than finishing, so the policy learns to hover. rlctl repeated an episode that
-        finished, and stopped shortly before its end.
+        finished, and stopped shortly before its end; or every recorded success pays less than the steps would
+        have paid that were left, by what episodes without a success earn.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
@@ -29,7 +31,38 @@ RULE = Rule(
 FAR_ABOVE = 5.0  # times the spread of early rewards; a robot that falls at speed ends with a good reward
 STOPS = (1, 2, 4, 8)  # steps before the end of a finished episode, to stop there
 CLEARLY = 0.1  # How much more stopping has to earn than finishing
+FEWEST, EARLY = 3, 0.5  # successes, and the part of the longest episode in which they are
+FAR_MORE = 2.0  # times as much as success; it may be worth less to stay where others were
 LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
+
+
+@judges_records(RULE, *rewards.WITH_SEARCH)
+def _compare_successes(records: Records) -> Iterator[RuleFinding]:
+    """Compare what recorded successes pay with what their episodes would have earned without them."""
+    episodes = rewards.require_rewarded(records)
+    longest = records.require_built().max_steps or max(one.steps for one in episodes)
+    # A late success loses little. What is to be learned is an early one.
+    early = [one for one in episodes if one.steps <= EARLY * longest]
+    finished = [one for one in early if one.terminated[-1] and rewards.ends_in_success(one)]
+    lasting = [one for one in episodes if one.steps >= longest and not rewards.has_succeeded(one)]
+    if len(finished) < FEWEST or not lasting:
+        return
+    income = float(np.median([one.rewards[one.steps // 2 :].mean() for one in lasting]))
+    if income <= 0:
+        return
+    least = min(finished, key=lambda one: _find_lost(one, income, longest) - FAR_MORE * one.rewards[-1])
+    lost, paid = _find_lost(least, income, longest), float(least.rewards[-1])
+    if lost <= FAR_MORE * max(paid, 0.0):
+        return
+    message = f"success ends an income, in each of {len(finished)} early successes: at step {least.steps} it pays {paid:.4g},"
+    message += f" and the steps until {longest} are worth {lost:.4g} (discount {rewards.DISCOUNT})"
+    message += f" at {income:.3g} per step, which episodes without a success earn"
+    yield RuleFinding(RULE, message, least.at(least.steps, value=lost, expected=f"below {paid:.6g}", per_step=income))
+
+
+def _find_lost(finished: CheckedEpisode, income: float, longest: int) -> float:
+    """Return what the steps would have earned from the success on until the time limit, discounted to it."""
+    return rewards.discounted_steps(income, 1 + longest - finished.steps)
 
 
 @judges_searches(RULE)

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.derived_fields import POLLUTION
 from rlctl.checking.experiments.worlds import MujocoTrials, judges_trials
 from rlctl.checking.mujoco_trials import name_columns, pair_rows, play
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -30,6 +29,7 @@ NEVER_COMPUTED = {
     "qfrc_inverse": "mj_inverse", "subtree_linvel": "mj_subtreeVel", "subtree_angmom": "mj_subtreeVel",
 }  # fmt: skip
 """Arrays that mj_step leaves at zero unless a sensor needs them, and what computes them."""
+LARGE = 100.0  # [N], [N m], [m/s]: a contact is often a force above a limit
 
 
 @judges_trials(RULE, place=20)
@@ -42,7 +42,7 @@ def _find_never_computed(trials: MujocoTrials) -> Iterator[RuleFinding]:
 
     def after_forces(name: str) -> Callable[[Any, Any], None]:
         def fill(_: Any, data: Any) -> None:
-            getattr(data, name)[:] = POLLUTION
+            getattr(data, name)[:] = LARGE
 
         return fill
 
