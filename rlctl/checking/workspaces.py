@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking import mujoco_worlds
 from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.worlds import WorldBody
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
+from rlctl.environments.info import find_mujoco
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim
 
@@ -64,6 +66,21 @@ def find_chains(env: Any) -> Iterator[Chain]:
         joints = [j for j in range(model.njnt) if model.jnt_type[j] in single]
         if len(joints) == model.njnt and FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:  # else the robot may be free
             yield _mujoco_chain(mujoco, model, data, joints)
+
+
+def find_objects(env: Any) -> dict[str, Numbers]:
+    """Return where the free bodies without joints are, by name, in PyBullet or MuJoCo [m]. Shape (3,) each."""
+    places: dict[str, Numbers] = {}
+    for client in find_clients():
+        for body in read_world(client).bodies:
+            if body.is_free and not body.joints:
+                places[body.name] = np.array(ClientCalls(client).getBasePositionAndOrientation(body.id)[0])
+    if (simulation := find_mujoco(env)) is not None:
+        model, data = simulation
+        for body in mujoco_worlds.read_world(model).bodies:
+            if body.is_free and not body.joints:
+                places[body.name] = np.array(data.qpos[model.jnt_qposadr[model.body_jntadr[body.id]] :][:3])
+    return places
 
 
 def _bullet_chain(p: ClientCalls, body: WorldBody) -> Chain:

@@ -3,7 +3,9 @@
 import mujoco
 import numpy as np
 import pybullet as p
+from broken_hindsight import Hindsight
 from broken_meaning import Robot
+from broken_overlaps import ArmAboveCube
 from broken_reach import Arm as Reach
 from broken_reach_bullet import Reacher
 from mujoco_robots import MujocoArm
@@ -117,3 +119,57 @@ class CrankPoints(Pusher):
 
 class RL626CrankOtherLink(CrankPoints):
     judged = 1
+
+
+class CrankPlacesCube(CrankPoints):
+    """It brings its cube to a place on the table."""
+
+    def size(self):
+        return super().size() + 2
+
+    def cube_place(self):
+        place, _ = p.getBasePositionAndOrientation(self.cube, physicsClientId=self.client)
+        return np.array(place[:2])
+
+    def observe(self):
+        to_goal = self.goal - self.cube_place()
+        return np.concatenate([super(CrankPoints, self).observe(), self.tip(), to_goal]).astype(np.float32)
+
+    def distance(self):
+        return float(np.linalg.norm(self.goal - self.cube_place()))
+
+
+class RL626CrankGoesItself(CrankPlacesCube):
+    def info(self, success):
+        return {"is_success": bool(np.linalg.norm(self.goal - self.tip()) < 0.03)}
+
+
+class ArmBringsCube(ArmAboveCube):
+    """The cube belongs at the goal."""
+
+    def observe(self):
+        cube = self.data.qpos[3:6]
+        return np.concatenate([self.data.qpos[:6], self.data.qvel[:6], self.tip(), self.goal - cube])
+
+    def distance(self):
+        return float(np.linalg.norm(self.goal - self.data.qpos[3:6]))
+
+
+class RL626ArmGoesItself(ArmBringsCube):
+    def succeeds(self):
+        return bool(np.linalg.norm(self.goal - self.tip()) < 0.05)
+
+
+class ArmAchieves(Hindsight, ArmBringsCube):
+    """What is achieved is the cube's place; the way to the goal is not observed."""
+
+    def observe(self):
+        return np.concatenate([self.data.qpos[:3], self.data.qvel[:6], self.tip()])
+
+    def achieved(self):
+        return self.data.qpos[3:6].copy()
+
+
+class RL626ArmAchievesItself(ArmAchieves):
+    def succeeds(self):
+        return bool(np.linalg.norm(self.goal - self.tip()) < 0.05)

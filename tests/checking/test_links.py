@@ -17,6 +17,9 @@ CASES = [
     broken("RL626ReachElbow", "broken_reach.py:Arm", slow=True),
     broken("RL626ReacherElbow", "broken_reach_bullet.py:Reacher", pybullet=True, slow=True),
     broken("RL626CrankOtherLink", "broken_links.py:CrankPoints", pybullet=True, slow=True),
+    broken("RL626CrankGoesItself", "broken_links.py:CrankPlacesCube", pybullet=True, slow=True),
+    broken("RL626ArmGoesItself", "broken_links.py:ArmBringsCube", pybullet=True, slow=True),
+    broken("RL626ArmAchievesItself", "broken_links.py:ArmAchieves", pybullet=True, slow=True),
 ]
 
 

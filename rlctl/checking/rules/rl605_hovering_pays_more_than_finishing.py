@@ -54,7 +54,9 @@ def _compare_successes(records: Records) -> Iterator[RuleFinding]:
     lost, paid = _find_lost(least, income, longest), float(least.rewards[-1])
     if lost <= FAR_MORE * max(paid, 0.0):
         return
-    message = f"success ends an income, in each of {len(finished)} early successes: at step {least.steps} it pays {paid:.4g},"
+    message = (
+        f"success ends an income, in each of {len(finished)} early successes: at step {least.steps} it pays {paid:.4g},"
+    )
     message += f" and the steps until {longest} are worth {lost:.4g} (discount {rewards.DISCOUNT})"
     message += f" at {income:.3g} per step, which episodes without a success earn"
     yield RuleFinding(RULE, message, least.at(least.steps, value=lost, expected=f"below {paid:.6g}", per_step=income))
