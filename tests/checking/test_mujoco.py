@@ -163,7 +163,7 @@ def test_a_fix_names_the_calls_of_the_own_engine():
     [finding] = findings("broken_mujoco.py:RL815HopperStateInTheLoop", "RL815")
     assert "mj_forward" in finding.fix
     assert "getLinkState" not in finding.fix
-    assert finding.name == "state is one step old"
+    assert finding.name == "state is out of date"
 
 
 @pytest.mark.slow

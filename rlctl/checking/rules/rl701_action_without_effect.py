@@ -26,6 +26,10 @@ RULE = Rule(
     """,
 )
 
+WHOLE_RANGE = (
+    "Map the whole range of the action to that of the motor, middle + action * half of its range; clipping leaves a "
+    "part of the action without effect. If the motor acts in one direction only, declare the range from 0 to 1."
+)
 MOST_DIMENSIONS = 64
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
 LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
@@ -54,8 +58,8 @@ def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
     left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
     yield from _without_effect(effects, len(every), left_out)
     if halves:
-        message = f"every value in one half of the range has the same effect: {list_names(halves)}"
-        yield _finding(halves, message, Severity.INFO)
+        message = f"half of the range is dead, every value there has the same effect: {list_names(halves)}"
+        yield _finding(halves, message, Severity.INFO, fix=WHOLE_RANGE)
 
 
 def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
@@ -129,6 +133,6 @@ def _without_effect(effects: Mapping[str, Effect], total: int, left_out: str) ->
             yield _finding(names[kind], message, Severity.ERROR if is_useless and not left_out else severity)
 
 
-def _finding(names: list[str], message: str, severity: Severity) -> RuleFinding:
+def _finding(names: list[str], message: str, severity: Severity, fix: str = "") -> RuleFinding:
     evidence = {"value": names, "seed": FIRST_SEED, "seeds": [FIRST_SEED, SECOND_SEED], "steps": STAGES[-1][1]}
-    return RuleFinding(RULE, message, evidence, severity)
+    return RuleFinding(RULE, message, evidence, severity, fix)

@@ -90,7 +90,8 @@ class _Sweep:
             rows = [self._play_all(part) for part in parts]
             if len({row.shape for row in rows}) != 1 or not np.isfinite(rows).all():
                 return None
-            for column, pair in _find_suspects(np.array(rows)):
+            suspects = sorted(_find_suspects(np.array(rows)), key=lambda found: -found[2])
+            for column, pair, _ in suspects:
                 jump = self._narrow(column, float(parts[pair]), float(parts[pair + 1]))
                 if jump is not None and all(self._jumps_in(state, jump) for state in STATES[1:]):
                     return jump
@@ -134,9 +135,9 @@ class _Sweep:
         return bool((high - low)[jump.column] / jump.size > PART_LEFT)
 
 
-def _find_suspects(rows: Numbers) -> Iterator[tuple[int, int]]:
-    """Yield the columns that change against their trend between one pair of values only, and that pair. Shape of rows:
-    (values, elements)."""
+def _find_suspects(rows: Numbers) -> Iterator[tuple[int, int, float]]:
+    """Yield the columns that change against their trend between one pair of values only, that pair, and by how much.
+    Shape of rows: (values, elements)."""
     changes = np.diff(rows, axis=0)
     for column, change in enumerate(changes.T):
         still = STILL * max(1.0, float(np.abs(rows[:, column]).max()))
@@ -146,4 +147,4 @@ def _find_suspects(rows: Numbers) -> Iterator[tuple[int, int]]:
         is_trend = np.count_nonzero(np.abs(others) > still) > len(others) / 2
         is_against = np.abs(against).sum() <= MOST_AGAINST * np.abs(others).sum()
         if is_trend and is_against and abs(change[pair]) > LEAST_JUMP * np.median(np.abs(others)):
-            yield column, pair
+            yield column, pair, float(np.abs(change[pair]))

@@ -1,4 +1,4 @@
-"""RL815: state is one step old."""
+"""RL815: state is out of date."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -29,7 +29,7 @@ from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
     "RL815",
-    "state is one step old",
+    "state is out of date",
     Severity.INFO,
     meaning="""
         An observation or a reward is computed from a state before the last step of the physics, and so is late
@@ -37,7 +37,7 @@ RULE = Rule(
         computeForwardKinematics returns the position before that step (an info); or the state is read before
         the last stepSimulation. MuJoCo - mj_step leaves xpos, site_xpos, sensordata and all else that follows
         from positions as they were at the beginning of its last substep; and where reset writes qpos without
-        mj_forward, they are of the episode before.
+        mj_forward, they are of the episode before, or 0 after mj_resetData.
     """,
     fix="""
         Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
@@ -113,6 +113,12 @@ def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Lo
         verb = "is" if len(columns) == 1 else "are"
         what = f"{name_columns(columns, size)} of reset {verb} computed before mj_forward"
         message = f"{what}: from poses and sensors as they were before qpos was written"
+        elements = [column for column in columns if column < size]
+        if elements and not plain[0].observation[elements].any():
+            message = (
+                f"{name_columns(elements, size)} of reset {verb} 0: nothing computes poses and sensors before the "
+            )
+            message += "first step"
         evidence = {"element": name_columns(columns[:1], size), "call": "reset", "seed": FIRST_SEED}
         yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=FORWARD_AT_RESET)
 
