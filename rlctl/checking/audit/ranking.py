@@ -160,7 +160,26 @@ def _explain_absence(rows: Mapping[str, MeanScore], has_success: bool) -> str:
         return f"the task does not call it a success: {', '.join(tried)}"
     if not has_success:
         return "the task says neither when it is a success nor what is commanded, and ships no policy"
-    return "no robot or object could be placed so that the task calls it a success, and it ships no policy"
+    why = "no robot or object could be placed so that the task calls it a success, and it ships no policy"
+    return f"{why}{_describe_lost_income(rows)}"
+
+
+def _describe_lost_income(rows: Mapping[str, MeanScore]) -> str:
+    """Return that one who never succeeds earns more than each that does; empty where that is not so."""
+    successful = [row for row in rows.values() if row.succeeds]
+    others = [row for row in rows.values() if row.success_rate == 0.0]
+    if not successful or not others:
+        return ""
+    best, other = (max(some, key=lambda row: row.mean_return) for some in (successful, others))
+    earned_more = _is_much_more(other.mean_return, best.mean_return)
+    if not earned_more or not _is_much_more(other.discounted, best.discounted):
+        return ""
+    succeeds = f"{best.name} succeeds in {best.success_rate:.0%} of its episodes and earns {best.mean_return:.4g}"
+    return f"; success does not pay: {succeeds}, {other.name} never does and earns {other.mean_return:.4g}"
+
+
+def _is_much_more(one: float, other: float) -> bool:
+    return one - other > MUCH * max(abs(one), abs(other))
 
 
 def _compare(played: Sequence[PlayedEpisode], row: MeanScore, wanted: str) -> Beaten | None:

@@ -1,5 +1,7 @@
 """The verdict from what competitors earned, with numbers that can be followed by hand."""
 
+import dataclasses
+
 import pytest
 
 from rlctl.checking.audit.play_world import PlayedEpisode
@@ -130,3 +132,13 @@ def test_costs_that_who_is_held_saves_do_not_count():
     assert sound.next_best == "; next is trembling with 14 %"
     nothing = episode("doing nothing", {"alive": 1000.0, "progress": 0.0, "torque": 0.0})
     assert judge(shipped, nothing).beaten[0].competitor == "doing nothing"
+
+
+def test_success_that_ends_an_income_is_named_where_nobody_shows_what_is_wanted():
+    trembling = episode("trembling", {}, success=True, steps=55)
+    trembling = dataclasses.replace(trembling, reward=28.0, discounted=22.0)
+    nothing = dataclasses.replace(episode("doing nothing", {}, steps=150), reward=85.0, discounted=44.0)
+    sentence = "success does not pay: trembling succeeds in 100% of its episodes and earns 28, doing nothing never does"
+    assert f"; {sentence} and earns 85" in judge(trembling, nothing).why_alone
+    cheap = dataclasses.replace(nothing, reward=25.0, discounted=13.0)
+    assert "success does not pay" not in judge(trembling, cheap).why_alone
