@@ -507,3 +507,13 @@ class ArmFeels(MujocoArm):
 class RL818ArmFeelsNothing(ArmFeels):
     def compute_forces(self):
         pass
+
+
+class ArmGrowsHeavyAndRemembers(RL817ArmGrowsHeavy):
+    """Keeps its last targets, which nothing reads."""
+
+    rlctl_ignore = {}
+
+    def targets(self, action):
+        self.last_targets = super().targets(action)
+        return self.last_targets

@@ -122,6 +122,7 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
         ("RL817ArmGrowsHeavy", "RL817", ("body_mass[1] (upper)",)),
         ("RL817HopperSlips", "RL817", ("geom_friction[", ", 0]")),
         ("RL302ArmKeepsActivation", "RL302", ("reset keeps state (data.act",)),
+        ("ArmGrowsHeavyAndRemembers", "RL302", ("reset keeps state (model.body_mass, self.last_targets)",)),
         ("RL818HopperForces", "RL818", ("data.cfrc_ext", "mj_rnePostConstraint")),
     ],
 )
