@@ -6,44 +6,46 @@ from mujoco_robots import MujocoArm
 from robots import Crawler
 
 
-class FallsBack:
+class Mapped:
+    def move(self, action):
+        super().move(self.map(action))
+
+
+class RL707RoverFallsBack(Mapped, Rover):
     """Actions above zero begin at the lowest command again."""
 
     def map(self, action):
         return np.where(action > 0, 1.5 * action - 1.0, action)
 
 
-class Switches:
+class RL707RoverSwitches(Mapped, Rover):
     """Actions above zero give half as much at once, and more."""
 
     def map(self, action):
         return np.where(action > 0, 0.5 + 0.5 * action, 0.5 * action)
 
 
-class Mapped:
-    def move(self, action):
-        super().move(self.map(action))
+class FallsBack(Mapped):
+    map = RL707RoverFallsBack.map
 
 
-class RL707RoverFallsBack(FallsBack, Mapped, Rover): ...
+class Switches(Mapped):
+    map = RL707RoverSwitches.map
 
 
-class RL707RoverSwitches(Switches, Mapped, Rover): ...
+class RL707DroneFallsBack(FallsBack, Drone): ...
 
 
-class RL707DroneFallsBack(FallsBack, Mapped, Drone): ...
+class RL707DroneSwitches(Switches, Drone): ...
 
 
-class RL707DroneSwitches(Switches, Mapped, Drone): ...
+class RL707ArmFallsBack(FallsBack, MujocoArm): ...
 
 
-class RL707ArmFallsBack(FallsBack, Mapped, MujocoArm): ...
+class RL707ArmSwitches(Switches, MujocoArm): ...
 
 
-class RL707ArmSwitches(Switches, Mapped, MujocoArm): ...
+class RL707CrawlerFallsBack(FallsBack, Crawler): ...
 
 
-class RL707CrawlerFallsBack(FallsBack, Mapped, Crawler): ...
-
-
-class RL707CrawlerSwitches(Switches, Mapped, Crawler): ...
+class RL707CrawlerSwitches(Switches, Crawler): ...
