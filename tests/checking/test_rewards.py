@@ -29,6 +29,16 @@ CASES = [
     broken("RL604FallsUntold", ("RL604", "warning"), ("RL609", "info"), twin="RL604FallsBadly", slow=True),
     broken("RL605Hovering", ("RL605", "warning"), twin="RL605FinishingPays", slow=True),
     broken("RL605HoveringUntold", ("RL605", "warning"), ("RL609", "info"), twin="RL605PaysProgress", slow=True),
+    *(
+        case(
+            f"broken_incomes.py:RL605{robot}EndsIncome",
+            ("RL605", "warning"),
+            twin=f"broken_incomes.py:{robot}PaysAll",
+            pybullet=True,
+            slow=True,
+        )
+        for robot in ("Rover", "Arm", "Reacher")
+    ),
     broken("RL606AliveBonus", ("RL606", "warning"), twin="RL606Paid", slow=True),
     broken("RL606AliveUntold", ("RL606", "info"), twin="RL606Paid", slow=True),
     broken("RL609SuccessUntold", ("RL609", "info"), twin="RL609SuccessArray", slow=True),
