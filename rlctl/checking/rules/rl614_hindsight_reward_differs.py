@@ -57,7 +57,7 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
         raise NotJudged("goals are missing or change their shape (RL101), or types are wrong (RL204)") from None
     ask = functools.partial(_ask, instance, compute)
     try:
-        computed = ask(*goals, infos)
+        computed = ask(goals[0], goals[1], infos)
     except EnvironmentRaised as error:
         message = f"compute_reward, of many goals at once, raises {error}"
         yield RuleFinding(RULE, message, {"steps": len(taken)})
