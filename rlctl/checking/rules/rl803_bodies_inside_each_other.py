@@ -26,7 +26,8 @@ RULE = Rule(
     """,
 )
 
-FEWEST_OVERLAPS = 2  # resets that put something into something else
+FEWEST_OVERLAPS = 2  # resets that put something into something else that moves
+MOST_IN_GROUND = 0.5  # part of the resets that may put something into what never moves: feet of a robot that is tilted
 LASTING_SOFT = 10  # [steps]; contacts of MuJoCo are soft by design, if they begin after a reset
 
 
@@ -68,7 +69,12 @@ def _find_overlap_at_reset(world: LoggedWorld, thrown: Collection[str]) -> Itera
             is_thrown = any(body in log.world.link_name(link) for body in thrown for link in pair)  # RL807 says it
             if frozenset(pair) in touching and not is_thrown:
                 starts.setdefault(pair, []).append(log)
-    often = [pair for pair in starts if len(starts[pair]) >= FEWEST_OVERLAPS]
+    moving = {body.id for body in world.world.bodies if body.is_free or body.joints}
+    fewest = dict.fromkeys(starts, FEWEST_OVERLAPS)
+    for pair in starts:
+        if not all(body in moving for body, _ in pair):
+            fewest[pair] = max(FEWEST_OVERLAPS, int(MOST_IN_GROUND * len(world.logs)) + 1)
+    often = [pair for pair in starts if len(starts[pair]) >= fewest[pair]]
     if not often:
         return
     pair = max(often, key=lambda pair: len(starts[pair]))
