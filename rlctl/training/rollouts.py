@@ -249,6 +249,7 @@ class Rollouts(abc.ABC):
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare the model to learn up to a step; start the first episodes of a new training."""
+        # It resets the environments if `_last_obs` is None; a resume has set it, with the episodes that ran.
         self.model._setup_learn(total_timesteps - self.model.num_timesteps, None, reset_num_timesteps=False)
 
     def advance(self, check: Check | None = None) -> None:
