@@ -89,7 +89,7 @@ def files(folder: str) -> list[Path]:
 
 
 def room_of(module: str) -> str:
-    """`rlctl.play.episode` -> `run`; `rlctl.limits.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
+    """`rlctl.play.episode` -> `play`; `rlctl.runs.report.show` -> `runs.report`; `rlctl.train` -> `__init__`."""
     parts = module.split(".")[1:]
     names = (".".join(parts[:2]), parts[0] if parts else "")
     return next((name for name in names if any(name in layer for layer in LAYERS)), "__init__")
