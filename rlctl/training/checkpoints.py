@@ -146,7 +146,11 @@ class Checkpoints:
             self._replay.remove_others(checkpoint_file.list_segments(self.run))
 
     def restore(self, saved: Checkpoint, changed: Sequence[str]) -> str:
-        """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact."""
+        """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact.
+
+        Callbacks start before: what their `on_start` changes in the model and in the progress is overwritten.
+        """
+        self.callbacks.start(resumed_at=saved.state.step)
         learner, file = self._learner, saved.folder / "policy.safetensors"
         info = PolicyFile.read_info(file)
         info.check_fits(learner.curriculum.goal, file)
