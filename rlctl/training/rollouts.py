@@ -127,11 +127,11 @@ class WorkerVecEnv(VecEnv):
             Play(steps, running, next_episodes, self.run_seed, rule, exploration, taught=self.taught)
         )
 
-    def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
-        """Wait for the steps that `start` began; `check` is called several times a second."""
+    def finish(self, watch: Callable[[], None] | None = None) -> SegmentArrays:
+        """Wait for the steps that `start` began; `watch` is called several times a second."""
         began = time.monotonic()
         try:
-            ended = self.workers.finish_playing(check=check)
+            ended = self.workers.finish_playing(watch=watch)
         except EpisodeFailed as error:
             error.actions = self._failed_actions(error)
             raise
@@ -226,7 +226,7 @@ class WorkerVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-Check = Callable[[], None]  # called several times a second while workers play; may raise to stop
+SegmentWatch = Callable[[], None]  # called several times a second while workers play; may raise to stop
 Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]
 """Mean and variance per normalised observation, "" for one that is not a dict."""
 
@@ -242,7 +242,7 @@ class Rollouts(abc.ABC):
         self.env = env
         self._algo = recipe.algo
         self._progress = progress
-        self._update = choose_update(model)
+        self._updater = choose_update(model)
         self._policy_info: PolicyInfo | None = None
         self._mirror = Mirror(model.mirror[0]) if hasattr(model, "mirror") else None  # of observations
         self.rehearse: Callable[[int], None] = lambda updates: None  # called after so many off-policy updates
@@ -252,27 +252,27 @@ class Rollouts(abc.ABC):
         # It resets the environments if `_last_obs` is None; a resume has set it, with the episodes that ran.
         self.model._setup_learn(total_timesteps - self.model.num_timesteps, None, reset_num_timesteps=False)
 
-    def advance(self, check: Check | None = None) -> None:
+    def advance(self, watch: SegmentWatch | None = None) -> None:
         """Play a segment and learn: from this segment, or with overlap from earlier ones."""
         self.model.policy.set_training_mode(False)
         self.start()
         if self.overlap:
             self.learn()
-        self.finish(check)
+        self.finish(watch)
         if not self.overlap:
             self.learn()
 
     def close(self) -> None:
         """End the learner's processes."""
-        if self._update is not self.model:
-            self._update.close()
+        if self._updater is not self.model:
+            self._updater.close()
 
     @abc.abstractmethod
     def start(self) -> None:
         """Let the workers start to play with the current policy."""
 
     @abc.abstractmethod
-    def finish(self, check: Check | None) -> None:
+    def finish(self, watch: SegmentWatch | None) -> None:
         """Wait for the segment, and store it in the model's buffer."""
 
     @abc.abstractmethod
