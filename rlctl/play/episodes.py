@@ -83,13 +83,13 @@ class Episodes:
             parts = {**parts, CRITIC: self.worlds.observe_privileged(index)}
         return parts
 
-    def replay(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
-        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
+    def repeat(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
+        """Begin episodes and repeat their actions; return the environments whose episode ended or failed."""
         left: list[int] = []
         episodes = {env: asked.episodes[env] for env in self.envs if env in asked.episodes}
         while episodes:
             try:
-                return left + self._replay(arrays, episodes)
+                return left + self._repeat(arrays, episodes)
             except FailedInEpisode as failure:
                 if not asked.may_fail:
                     raise
@@ -99,7 +99,7 @@ class Episodes:
                 print_line(f"{failure} when it was replayed")
         return left
 
-    def _replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> list[int]:
+    def _repeat(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> list[int]:
         """Take the recorded actions in lockstep; return the environments whose episode ended."""
         index = np.array([*episodes], np.int64) - self.first
         shown = self._begin(arrays, index, [seed for seed, _ in episodes.values()])
@@ -108,11 +108,11 @@ class Episodes:
         lengths = np.array([len(actions.get(world, ())) for world in range(self.worlds.count)])
         has_actions = lengths[index] > 0
         first = {key: part[has_actions] for key, part in shown.items() if key != CRITIC}
-        recorder = _Replayer(RecordedActions(actions), self, arrays)
+        repeater = _Repeater(RecordedActions(actions), self, arrays)
         self.begin_rows(self.teacher, index)
         left: list[int] = []
         try:
-            for played in self._playing.play(recorder, index[has_actions], join(first)):
+            for played in self._playing.play(repeater, index[has_actions], join(first)):
                 index = played.index
                 self._write_current(arrays, index, self._show(played.result.observation, index))
                 left += (played.ended + self.first).tolist()
@@ -140,7 +140,7 @@ class Episodes:
             self._fail(error, int(segment.index[0]))
 
 
-class _Replayer(Actor):
+class _Repeater(Actor):
     """An actor that acts as another, and lets the teacher see every step: it may have a recurrent state."""
 
     def __init__(self, actor: RecordedActions, episodes: Episodes, arrays: SharedArrays) -> None:

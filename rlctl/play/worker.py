@@ -59,7 +59,7 @@ class Worker:
             case messages.Play():
                 return Answer(ended=self._play(message))
             case messages.BeginEpisodes():
-                return Answer(left=[env for group in self._groups for env in group.replay(self._arrays, message)])
+                return Answer(left=[env for group in self._groups for env in group.repeat(self._arrays, message)])
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._groups[0].worlds, message.achieved, message.desired))
             case messages.Build():

@@ -191,9 +191,9 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
     def begin_episodes(
         self, episodes: Mapping[int, EpisodeSoFar], *, doing: str = "stepping", may_fail: bool = False
     ) -> set[int]:
-        """Begin episodes, environment index -> (seed, actions so far), and replay their actions.
+        """Begin episodes, environment index -> (seed, actions so far), and repeat their actions.
 
-        Return the environments whose episode ended during the replay; with `may_fail` also those whose episode failed,
+        Return the environments whose episode ended meanwhile; with `may_fail` also those whose episode failed,
         which raises otherwise. Errors mention `doing`.
         """
         dtype = self.arrays.segment.action.dtype

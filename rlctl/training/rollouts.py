@@ -109,7 +109,7 @@ class WorkerVecEnv(VecEnv):
         return np.concatenate(self._actions[env])
 
     def begin_episodes(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
-        """Restore running episodes by replaying their actions; return the environments whose episode ended early."""
+        """Restore running episodes by repeating their actions; return the environments whose episode ended early."""
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
         episodes = dict(enumerate(zip(seeds, actions, strict=True)))
