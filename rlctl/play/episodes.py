@@ -11,11 +11,12 @@ from rlctl.environments.dict_spaces import SINGLE, join, split
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 from rlctl.play import messages
 from rlctl.play.messages import EpisodeResult, FailedInEpisode
-from rlctl.play.playing import Index, Playing, RecordedActions
+from rlctl.play.playing import Playing, RecordedActions
 from rlctl.play.seeds import list_training_seeds
 from rlctl.play.shared_arrays import CRITIC, SharedArrays
 from rlctl.policy.actor import Actor, Array, Rows
 from rlctl.printed_lines import print_line
+from rlctl.task.world_index import WorldIndex
 
 
 class Episodes:
@@ -52,7 +53,7 @@ class Episodes:
         """Return rows of worlds as those of actors."""
         return Rows(rows.index + self._row, rows.seed, rows.step) if self._row else rows
 
-    def begin_rows(self, actor: Actor | None, index: Index) -> None:
+    def begin_rows(self, actor: Actor | None, index: WorldIndex) -> None:
         """Let an actor begin the episodes of worlds."""
         if actor is not None:
             actor.begin(self.as_rows(self._playing.select(index)))
@@ -63,7 +64,7 @@ class Episodes:
             return None
         return self.teacher.act(self.worlds.teacher_sees(rows.index), self.as_rows(rows))[1]
 
-    def _begin(self, arrays: SharedArrays, index: Index, seeds: Sequence[int]) -> dict[str, Any]:
+    def _begin(self, arrays: SharedArrays, index: WorldIndex, seeds: Sequence[int]) -> dict[str, Any]:
         """Begin episodes; return their first observations by key, with what only the critic sees."""
         self._time[index] = 0.0
         self._deepest[index] = np.nan
@@ -77,7 +78,7 @@ class Episodes:
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(index[0]))
 
-    def _show(self, observations: Any, index: Index) -> dict[str, Any]:
+    def _show(self, observations: Any, index: WorldIndex) -> dict[str, Any]:
         parts: dict[str, Any] = split(observations)
         if self._has_critic:
             parts = {**parts, CRITIC: self.worlds.observe_privileged(index)}
@@ -122,7 +123,7 @@ class Episodes:
         arrays.inside[self.first : self.first + self.worlds.count, 1] = -1
         return left
 
-    def _write_current(self, arrays: SharedArrays, index: Index, shown: Mapping[str, Any]) -> None:
+    def _write_current(self, arrays: SharedArrays, index: WorldIndex, shown: Mapping[str, Any]) -> None:
         for key, part in shown.items():
             arrays.observation[key][self.first + index] = part
 
@@ -164,7 +165,7 @@ class _Segment(Actor):
         self._inside = arrays.inside[own]
         self._steps, self._rows = self._inside[:, 1], self._inside[:, 2]
         self._ones = np.ones(self._worlds.count, np.int64)
-        self.index: Index = np.zeros(1, np.int64)  # the worlds that play, for errors
+        self.index: WorldIndex = np.zeros(1, np.int64)  # the worlds that play, for errors
         self._row = 0
         self._acting_s = self._stepping_s = 0.0  # since the worlds that play changed last
         self._acted_s = 0.0  # when the last action was chosen
@@ -176,13 +177,13 @@ class _Segment(Actor):
         contacts = [env - self._first for env in asked.contacts if env in episodes.envs]
         self._contacts = np.array(contacts, np.int64)
 
-    def _at(self, row: int, index: Index) -> Any:
+    def _at(self, row: int, index: WorldIndex) -> Any:
         """Return the place of some worlds in a row of arrays; NumPy is fastest where the whole row is meant."""
         if len(index) == self._worlds.count:
             return row
         return row, index
 
-    def play(self, index: Index, seeds: NDArray[np.int64]) -> list[EpisodeResult]:
+    def play(self, index: WorldIndex, seeds: NDArray[np.int64]) -> list[EpisodeResult]:
         """Begin the episodes whose seeds are not negative, and play."""
         arrays, asked, segment = self._arrays, self._asked, self._segment
         episodes, playing = self._episodes, self._episodes._playing
@@ -235,7 +236,7 @@ class _Segment(Actor):
         # In the order of environments that play one after the other.
         return sorted(self._ended, key=lambda ended: ended.env)
 
-    def _keep_last(self, index: Index) -> None:
+    def _keep_last(self, index: WorldIndex) -> None:
         for key, part in self._segment.observation.items():
             self._arrays.observation[key][self._first + index] = part[self._row, index]
 
@@ -270,7 +271,7 @@ class _Segment(Actor):
         for world in np.intersect1d(self.index, self._contacts).tolist():
             deepest[world] = np.fmax(deepest[world], self._worlds.deepest_contact(world))
 
-    def _finish(self, ended: Index) -> None:
+    def _finish(self, ended: WorldIndex) -> None:
         """Note the episodes that ended in some worlds, and begin those that follow them."""
         arrays, asked, segment, row = self._arrays, self._asked, self._segment, self._row
         self._note_times()

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
+from rlctl.task.world_index import WorldIndex
 from rlctl.task.worlds import EpisodeTotals, WorldsStep
 
-Index = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
@@ -23,17 +23,17 @@ class Worlds(Protocol):
 
     count: int
     action_space: spaces.Space[Any]
-    step_of: Index
+    step_of: WorldIndex
     """Steps since the start of each world's episode, the one that runs included; shape (count,)."""
 
-    def reset(self, worlds: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
+    def reset(self, worlds: WorldIndex, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...)."""
 
-    def shorten(self, worlds: Index, limits: Index) -> None:
+    def shorten(self, worlds: WorldIndex, limits: NDArray[np.int64]) -> None:
         """Truncate the next episodes of some worlds after so many steps, or after the task's time limit where it is 0;
         only worlds of a task can."""
 
-    def step(self, action: Any, worlds: Index | None = None) -> WorldsStep:
+    def step(self, action: Any, worlds: WorldIndex | None = None) -> WorldsStep:
         """Advance some worlds by a step; `action` has a row for each, shape (k, ...)."""
 
     def totals(self, world: int) -> EpisodeTotals:
@@ -44,10 +44,10 @@ class Worlds(Protocol):
 class Played:
     """A step of some worlds."""
 
-    index: Index  # of the worlds, shape (k,)
+    index: WorldIndex  # of the worlds, shape (k,)
     action: Any
     result: WorldsStep
-    ended: Index  # the worlds whose episode has ended
+    ended: WorldIndex  # the worlds whose episode has ended
 
 
 class NoMoreActions(Exception):
@@ -59,12 +59,12 @@ class Playing:
 
     def __init__(self, worlds: Worlds) -> None:
         self.worlds = worlds
-        self.seeds: Index = np.full(worlds.count, -1, np.int64)  # of the episode of each world
-        self._none: Index = np.zeros(0, np.int64)
+        self.seeds: NDArray[np.int64] = np.full(worlds.count, -1, np.int64)  # of the episode of each world
+        self._none: WorldIndex = np.zeros(0, np.int64)
         self._index = self._none  # the worlds that play
         self._observations: Any = None  # of these, before their next action
 
-    def begin(self, index: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
+    def begin(self, index: WorldIndex, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...).
 
         In the loop of `play` they follow on episodes that ended.
@@ -77,13 +77,13 @@ class Playing:
                 part[at] = split(first)[key]
         return first
 
-    def select(self, index: Index) -> Rows:
+    def select(self, index: WorldIndex) -> Rows:
         """Return some worlds as rows."""
         if len(index) == self.worlds.count:
             return Rows(index, self.seeds, self.worlds.step_of)
         return Rows(index, self.seeds[index], self.worlds.step_of[index])
 
-    def play(self, actor: Actor, index: Index, observations: Any) -> Iterator[Played]:
+    def play(self, actor: Actor, index: WorldIndex, observations: Any) -> Iterator[Played]:
         """Continue the episodes of worlds, in ascending order, whose `observations` are given; yield each step.
 
         An episode that ends leaves, unless another has begun there. `NoMoreActions` from the actor ends the loop; other
@@ -108,7 +108,7 @@ class Playing:
         finally:
             self._index = self._none
 
-    def stop(self, worlds: Index) -> None:
+    def stop(self, worlds: WorldIndex) -> None:
         """Let some worlds play no further."""
         staying = np.isin(self._index, worlds, invert=True)
         if not staying.all():

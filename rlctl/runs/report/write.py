@@ -15,7 +15,7 @@ from rlctl.runs.compare.report import describe_candidate, describe_seeds, descri
 from rlctl.runs.report import content
 from rlctl.runs.report.content import RunReport
 from rlctl.runs.report.show import describe_robustness, tabulate
-from rlctl.runs.tables import Rows
+from rlctl.runs.tables import TableRows
 from rlctl.storage import files
 
 _PICTURES = 6  # of an episode
@@ -172,7 +172,7 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
     return verdicts, [f"all runs were evaluated with the baseline's {', '.join(worlds)}"] if worlds else []
 
 
-def _split_terms(rows: Rows) -> list[tuple[list[str], list[list[str]]]]:
+def _split_terms(rows: TableRows) -> list[tuple[list[str], list[list[str]]]]:
     """Return the table of evaluations, and that of the reward terms if there are any, as columns and cells."""
     main = [{name: value for name, value in row.items() if not name.startswith("term/")} for row in rows]
     terms = [{name: value for name, value in row.items() if name.startswith(("term/", "steps"))} for row in rows]

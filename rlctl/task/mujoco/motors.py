@@ -32,7 +32,7 @@ from rlctl.task.mujoco.real_motors import (
     delay_of,
     list_history,
 )
-from rlctl.task.mujoco.world import Rows
+from rlctl.task.world_index import WorldIndex
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.owner import BodyOwner
@@ -103,7 +103,7 @@ class MujocoMotors(Body):
         sim.mujoco.mj_fullM(sim.model, sim.data, full)
         self.parts.inertia = np.diag(full)[self.parts.velocities].copy()
 
-    def forget_motors(self, worlds: Rows) -> None:
+    def forget_motors(self, worlds: WorldIndex | None) -> None:
         """Let nothing drive the joints after a reset, until the next command."""
         self.parts.active.clear()
 
