@@ -18,7 +18,7 @@ from rlctl.environments.driven_joints import describe_driven_joints, joint_name
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
 from rlctl.task.commands import CommandTerm
-from rlctl.task.history import Start
+from rlctl.task.history import HistoryStart
 from rlctl.task.joints import Joints
 from rlctl.task.layout import Layout
 from rlctl.task.terms import (
@@ -59,7 +59,7 @@ class EnvInfo(pydantic.BaseModel):
     observation_units: dict[str, str] = {}
     observation_history: dict[str, int] = {}
     """Number of last values, oldest first, of the observations that are histories; their sizes include all."""
-    history_start: Start = "first"  # what fills histories when an episode begins
+    history_start: HistoryStart = "first"  # what fills histories when an episode begins
     observation_terms: dict[str, AnyTerm] = {}  # observations that are computed from measured quantities
     quantity_sizes: dict[str, int] = {}
     """Size per measured quantity of the terms, in the order of the terms and of their inputs."""

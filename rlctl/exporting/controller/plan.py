@@ -15,7 +15,7 @@ from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
 from rlctl.errors import RecipeError, UsageError
 from rlctl.limits.fitting import FittedLimits
 from rlctl.policy.c_policy import observation_type
-from rlctl.task.joints import Command
+from rlctl.task.joints import CommandKind
 from rlctl.task.layout import Layout, Part
 from rlctl.task.terms import ClipOrientation, Gravity, Internal, Playback, Scaled
 
@@ -61,7 +61,7 @@ class Observed(Part):
 class JointTarget:
     """What an action commands: `base + factor * action`."""
 
-    kind: Command
+    kind: CommandKind
     factor: NDArray[np.float64]
     default: NDArray[np.float64]  # of positions; zeros for the other kinds
     measured: int  # where the inputs have the joints' positions, for steps

@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 from rlctl.errors import TaskError, check_name, in_world
 from rlctl.task.events.acting import Streams, check_drawn
-from rlctl.task.events.event import BoundEvent, Drawn, Parts, Signal, Widening
+from rlctl.task.events.event import BoundEvent, Drawn, ObservationParts, Signal, Widening
 from rlctl.task.events.world_signals import WORLD_SIGNALS, Array
 from rlctl.task.layout import Layout
 from rlctl.task.world_index import WorldIndex
@@ -26,7 +26,7 @@ class Signals:
         self,
         worlds: int,
         events: Mapping[str, BoundEvent],
-        first: Parts,
+        first: ObservationParts,
         action_space: spaces.Space[Any],
         bounds: Mapping[str, tuple[float, float]],
     ) -> None:
@@ -69,7 +69,7 @@ class Signals:
         with in_world(world):
             self.drawn[world][name] = acting.begin(world, self._streams[world][name], first, level)
 
-    def observe(self, parts: Parts, worlds: WorldIndex) -> Parts:
+    def observe(self, parts: ObservationParts, worlds: WorldIndex) -> ObservationParts:
         """Return observations of some worlds, each of shape (k, ...), with noise and delay."""
         if not self.on_observation:
             return parts
@@ -100,7 +100,7 @@ class Signals:
             values = acting.change(values, worlds)
         return np.clip(values.reshape(action.shape), space.low, space.high).astype(space.dtype)
 
-    def try_once(self, first: Parts) -> dict[str, Drawn]:
+    def try_once(self, first: ObservationParts) -> dict[str, Drawn]:
         """Begin every signal once, to find mistakes; return the drawn values by event."""
         acting = [*self.on_observation, *self.on_action]
         self.begin(0, {signal.event.name: np.random.default_rng(0) for signal in acting}, 1.0)
@@ -111,7 +111,7 @@ class Signals:
 class _SignalEvent:
     """An event on observations or actions; a user's own function knows one world only and is called per world."""
 
-    def __init__(self, event: BoundEvent, worlds: int, first: Parts) -> None:
+    def __init__(self, event: BoundEvent, worlds: int, first: ObservationParts) -> None:
         self.event, self.names = event, list(first)
         self.layout = Layout({name: int(np.size(value)) for name, value in first.items()})
         self._shapes = {name: np.shape(value) for name, value in first.items()}
@@ -148,12 +148,12 @@ class _SignalEvent:
                 changed[row] = np.concatenate([parts[name] for name in self.names], axis=None)
         return changed
 
-    def _split(self, row: Array) -> Parts:
+    def _split(self, row: Array) -> ObservationParts:
         parts = self.layout.split(row.copy())
         return {name: values.reshape(self._shapes[name]) for name, values in parts.items()}
 
 
-def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
+def _find_observed(event: BoundEvent, first: ObservationParts) -> list[str]:
     names = [event.event.of] if isinstance(event.event.of, str) else list(event.event.of)
     for name in names:
         check_name(name, first, f"events.{event.name}: no observation", event.error, listed="There is")

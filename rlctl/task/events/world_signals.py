@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.task.events.event import Drawn, Parts, Range, Signal
+from rlctl.task.events.event import Drawn, ObservationParts, Range, Signal
 from rlctl.task.layout import Layout
 from rlctl.task.world_index import WorldIndex
 
@@ -85,17 +85,17 @@ WORLD_SIGNALS: dict[Callable[..., Any], type[WorldSignal]] = {}
 
 
 def in_one_world(
-    signal: type[WorldSignal], rng: np.random.Generator, first: Parts, **ranges: Range
+    signal: type[WorldSignal], rng: np.random.Generator, first: ObservationParts, **ranges: Range
 ) -> tuple[Drawn, Signal]:
     """Start a signal for one world, as the function of an event does; authors may call it in functions of their own."""
     layout = Layout({name: int(np.size(value)) for name, value in first.items()})
     world = np.zeros(1, np.int64)
     rows = signal(1, layout.size, {name: high for name, (_, high) in ranges.items()})
 
-    def join(parts: Parts) -> Array:
+    def join(parts: ObservationParts) -> Array:
         return np.concatenate([np.asarray(parts[name], np.float64) for name in first], axis=None)
 
-    def change(parts: Parts) -> Parts:
+    def change(parts: ObservationParts) -> ObservationParts:
         changed = layout.split(rows(join(parts)[None], world)[0])
         return {name: values.reshape(np.shape(parts[name])) for name, values in changed.items()}
 

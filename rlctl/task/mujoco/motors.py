@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body, Drives
-from rlctl.task.motors import Motor, Motors
+from rlctl.task.motors import AnyMotors, Motor
 from rlctl.task.mujoco.ideal_motors import IDEAL_DAMPING, IdealMotors
 from rlctl.task.mujoco.parts import Parts, find_slice
 from rlctl.task.mujoco.real_motors import (
@@ -127,7 +127,7 @@ class MujocoMotors(Body):
         self._write_armature(inertia)
         self._modes.clear()
 
-    def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
+    def set_motors(self, motors: AnyMotors, *, joints: Sequence[str] = (), **changes: Any) -> None:
         chosen = self._spread_motors(motors, joints, changes)
         self._check_armature(chosen)
         self.parts.real |= chosen
