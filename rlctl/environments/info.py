@@ -13,7 +13,7 @@ import numpy as np
 import pydantic
 from gymnasium import spaces
 
-from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
+from rlctl.environments.dict_spaces import LARGEST_SPACE, SINGLE, format_space, split_space
 from rlctl.environments.driven_joints import describe_driven_joints, joint_name
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
@@ -82,6 +82,17 @@ class EnvInfo(pydantic.BaseModel):
     def layout(self) -> Layout:
         """Where its named observations, and the values of their histories, are in the flat one."""
         return Layout(self.observation_sizes, self.observation_history)
+
+    def find_sizes(self, frames: int = 1) -> dict[str, int]:
+        """Return the elements of each named observation, or key of a Dict, in one of the `frames` of a stack.
+
+        Where the names are unknown, all elements are `observation`.
+        """
+        parts = split_space(self.spaces()[0])
+        of_keys = {key: math.prod(part.shape or ()) for key, part in parts.items()}
+        total = sum(of_keys.values()) // frames
+        sizes = dict(self.observation_sizes) if SINGLE in parts else of_keys
+        return sizes if sum(sizes.values()) == total else {"observation": total}
 
     def find_difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
         """Describe how the spaces of `other` differ from these; None if they are equal."""

@@ -125,7 +125,7 @@ class _Export:
         model = build_graph(self.policy, self.plan, self.mapping)
         content = encode(model)
         controller = OnnxController(content)
-        target = self.plan.find_target(None)
+        target = self.plan.target
         fields, recorded = self._verify(path, controller, target, is_limited=False)
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6
