@@ -4,45 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, split
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
 from rlctl.task.world_index import WorldIndex
-from rlctl.task.worlds import EpisodeTotals, WorldsStep
+from rlctl.task.worlds import TaskWorlds, WorldsStep
 
 Flags = NDArray[np.bool_]
 
 
-class Worlds(Protocol):
-    """`count` worlds, each with its own episode; a task or a Gymnasium environment. All arrays have a row per world."""
-
-    count: int
-    action_space: spaces.Space[Any]
-    step_of: WorldIndex
-    """Steps since the start of each world's episode, the one that runs included; shape (count,)."""
-
-    def reset(self, worlds: WorldIndex, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
-        """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...)."""
-
-    def shorten(self, worlds: WorldIndex, limits: NDArray[np.int64]) -> None:
-        """Truncate the next episodes of some worlds after so many steps, or after the task's time limit where it is 0;
-        only worlds of a task can."""
-
-    def step(self, action: Any, worlds: WorldIndex | None = None) -> WorldsStep:
-        """Advance some worlds by a step; `action` has a row for each, shape (k, ...)."""
-
-    def totals(self, world: int) -> EpisodeTotals:
-        """Return what the running episode of a world has added up to."""
+Worlds = TaskWorlds | GymWorlds
+"""`count` worlds, each with its own episode, of a task or a Gymnasium environment. All arrays have a row per world."""
 
 
 @dataclasses.dataclass(slots=True)
 class Played:
-    """A step of some worlds."""
+    """A step of some worlds.
+
+    It is valid until the next one. `Playing.begin` writes the first observation of an episode over the last one of the
+    episode before, in `result.observation`.
+    """
 
     index: WorldIndex  # of the worlds, shape (k,)
     action: Any
@@ -60,6 +46,7 @@ class Playing:
     def __init__(self, worlds: Worlds) -> None:
         self.worlds = worlds
         self.seeds: NDArray[np.int64] = np.full(worlds.count, -1, np.int64)  # of the episode of each world
+        self._has_begun: Flags = np.zeros(worlds.count, bool)  # in which worlds an episode has followed the ended one
         self._none: WorldIndex = np.zeros(0, np.int64)
         self._index = self._none  # the worlds that play
         self._observations: Any = None  # of these, before their next action
@@ -71,6 +58,7 @@ class Playing:
         """
         self.seeds[index] = seeds
         first = self.worlds.reset(index, seeds, levels)
+        self._has_begun[index] = True
         if len(self._index):
             at = np.searchsorted(self._index, index)
             for key, part in split(self._observations).items():
@@ -102,9 +90,10 @@ class Playing:
                 ended = self._none
                 if True in result.terminated.tolist() or True in result.truncated.tolist():  # faster than NumPy's any
                     ended = rows.index[result.terminated | result.truncated]
+                    self._has_begun[ended] = False
                 yield Played(rows.index, action, result, ended)
                 if len(ended):
-                    self.stop(ended[self.worlds.step_of[ended] > 0])
+                    self.stop(ended[~self._has_begun[ended]])
         finally:
             self._index = self._none
 
