@@ -69,7 +69,7 @@ class Episodes:
         self.times_s[index] = 0.0
         self.deepest[index] = np.nan
         envs = self.first + index
-        arrays.inside[envs, 0], arrays.inside[envs, 1] = seeds, 0
+        arrays.call_seed[envs], arrays.call_step[envs] = seeds, 0
         self.playing.seeds[index] = seeds
         self.worlds.step_of[index] = 0
         self.worlds.shorten(index, arrays.limit[envs])
@@ -121,7 +121,7 @@ class Episodes:
                 self.playing.stop(index[self.worlds.step_of[index] >= lengths[index]])
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(index[0]))
-        arrays.inside[self.first : self.first + self.worlds.count, 1] = -1
+        arrays.call_step[self.first : self.first + self.worlds.count] = -1
         return left
 
     def write_current(self, arrays: SharedArrays, index: WorldIndex, shown: Mapping[str, Any]) -> None:
@@ -152,7 +152,7 @@ class _Repeater(Actor):
     def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
         """Return the actor's actions."""
         self._episodes.teach(rows)
-        self._arrays.inside[self._episodes.first + rows.index, 1] = rows.step + 1
+        self._arrays.call_step[self._episodes.first + rows.index] = rows.step + 1
         return self._actor.act(observations, rows)
 
 
@@ -164,8 +164,7 @@ class _Segment(Actor):
         self._worlds, self._first = episodes.worlds, episodes.first
         own = slice(self._first, self._first + self._worlds.count)
         self._segment = arrays.segment.by_step(own)  # arrays of shape (steps, worlds, ...)
-        self._inside = arrays.inside[own]
-        self._steps, self._rows = self._inside[:, 1], self._inside[:, 2]
+        self._steps, self._rows = arrays.call_step[own], arrays.call_row[own]
         self._ones = np.ones(self._worlds.count, np.int64)
         self.index: WorldIndex = np.zeros(1, np.int64)  # the worlds that play, for errors
         self._row = 0
@@ -200,7 +199,7 @@ class _Segment(Actor):
         for key, part in segment.observation.items():
             part[0, index] = arrays.observation[key][envs]
         first = {key: part[envs] for key, part in arrays.observation.items() if key != CRITIC}
-        self._inside[index, 0] = playing.seeds[index]
+        arrays.call_seed[envs] = playing.seeds[index]
         observations = segment.observation.items()
         only = segment.observation[SINGLE] if list(segment.observation) == [SINGLE] else None
         segment.terminated[:, index], segment.truncated[:, index] = False, False

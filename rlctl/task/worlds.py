@@ -320,23 +320,26 @@ class TaskWorlds:
         return self.count == 1 or (len(worlds) == self.count and bool((worlds == self._all).all()))
 
     def _step(self, chosen: Any, worlds: WorldIndex) -> WorldsStep:
+        """Take a step; `chosen` and what is returned have rows of `worlds`, names in `_of_all` those of all worlds."""
         is_all, calls = worlds is self._all, self.calls
         acted = self._signals.act(chosen, worlds)
         if is_all:
+            chosen_of_all = chosen
             calls.act(acted)
             self.sim.step()
         else:
+            chosen_of_all = self._spread(chosen, worlds)
             calls.act(self._spread(acted, worlds))
             self.sim.step(worlds)
-            chosen = self._spread(chosen, worlds)
         if self.after_physics is not None:
             self.after_physics()
-        terminated = calls.is_terminated()
-        gained = self.rewards(chosen)
+        terminated_of_all = calls.is_terminated()
+        gained_of_all = self.rewards(chosen_of_all)
         if is_all:
+            terminated, gained = terminated_of_all, gained_of_all
             np.add(self._gained, gained, out=self._gained)
         else:
-            terminated, gained = terminated[worlds], gained[worlds]
+            terminated, gained = terminated_of_all[worlds], gained_of_all[worlds]
             self._gained[worlds] += gained
         reward, terms = gained[:, 0], gained[:, 1:]
         truncated = self._find_truncated(terminated, worlds)
@@ -346,11 +349,11 @@ class TaskWorlds:
             self._run_due(worlds)
         success = None
         if self.has_success:
-            success = calls.is_success()
+            success_of_all = calls.is_success()
             if is_all:
-                self._last_success = success
+                success = self._last_success = success_of_all
             else:
-                success = success[worlds]
+                success = success_of_all[worlds]
                 self._last_success[worlds] = success
         observation = self._observe(worlds)
         calls.check_kept("a step")

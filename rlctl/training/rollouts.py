@@ -120,7 +120,7 @@ class WorkerVecEnv(VecEnv):
     def start(self, steps: int, exploration: Exploration) -> None:
         """Begin to play `steps` steps of each environment."""
         self._steps, self._is_playing = steps, True
-        self.workers.arrays.inside[:, 2] = -1
+        self.workers.arrays.call_row[:] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
         rule = self._level_rule
         self.workers.start_playing(
@@ -172,14 +172,14 @@ class WorkerVecEnv(VecEnv):
     @property
     def steps_in_segment(self) -> int:
         """How many steps of the segment that is being played were begun so far, by all environments."""
-        return int((self.workers.arrays.inside[:, 2] + 1).sum()) if self._is_playing else 0
+        return int((self.workers.arrays.call_row + 1).sum()) if self._is_playing else 0
 
     def last_observations(self) -> dict[str, NDArray[Any]]:
         """Return the last observations, by key, of all segments that were finished, shape (n_envs, ...)."""
         arrays = self.workers.arrays
         observations = {key: array.copy() for key, array in arrays.observation.items()}
         if self._is_playing:
-            begun = arrays.inside[:, 2] >= 0  # row 0 was written before; those done have replaced the other
+            begun = arrays.call_row >= 0  # row 0 was written before; those done have replaced the other
             for key, array in observations.items():
                 array[begun] = arrays.segment.observation[key][begun, 0]
         return observations
@@ -187,7 +187,7 @@ class WorkerVecEnv(VecEnv):
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions of a failed episode; the last is that of the failed step."""
         arrays = self.workers.arrays
-        rows = int(arrays.inside[error.env, 2]) + 1
+        rows = int(arrays.call_row[error.env]) + 1
         if error.step <= rows:
             return arrays.segment.action[error.env, rows - error.step : rows].copy()
         return np.concatenate([self.join_actions(error.env), arrays.segment.action[error.env, :rows]])
