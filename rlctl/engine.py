@@ -8,8 +8,8 @@ from typing import Any, Literal, cast, get_args
 
 from rlctl.errors import UsageError, did_you_mean
 
-Name = Literal["pybullet", "mujoco"]
-_NAMES = get_args(Name)
+EngineName = Literal["pybullet", "mujoco"]
+_NAMES = get_args(EngineName)
 _TITLES = {"": "", "pybullet": "PyBullet", "mujoco": "MuJoCo"}
 _DEFAULT_SOLREF = 0.02  # [s], of MuJoCo
 FORMS = "pybullet, mujoco, or mujoco:SOLREF with 0 < SOLREF < 1 s"
@@ -66,7 +66,7 @@ def read_engine(text: str, option: str = "sim") -> Engine:
     if name not in _NAMES:
         raise UsageError(f"{option} {text!r}: no such engine.{did_you_mean(name, _NAMES)} Give {FORMS}")
     if not colon:
-        return Engine(cast(Name, name))
+        return Engine(cast(EngineName, name))
     try:
         solref = float(value)
     except ValueError:

@@ -89,7 +89,7 @@ def files(folder: str) -> list[Path]:
 
 
 def room_of(module: str) -> str:
-    """`rlctl.play.episode` -> `run`; `rlctl.limits.limits` -> `deploy.filter`; `rlctl.train` -> `__init__`."""
+    """`rlctl.play.episode` -> `play`; `rlctl.runs.report.show` -> `runs.report`; `rlctl.train` -> `__init__`."""
     parts = module.split(".")[1:]
     names = (".".join(parts[:2]), parts[0] if parts else "")
     return next((name for name in names if any(name in layer for layer in LAYERS)), "__init__")
@@ -143,6 +143,38 @@ def test_a_class_name_means_one_thing():
     names = [name for text in texts for name in re.findall(r"^ *class (\w+)[(:]", text, re.MULTILINE)]
     assert len(names) > 100
     assert {name for name in names if names.count(name) > 1} == set()
+
+
+MAY_SHARE_A_NAME = {
+    "rlctl/options.py: Checkpoint",  # an option of commands, as the user writes it
+    "rlctl/recipe/network_parameters.py: Activation",  # a value of a recipe's key
+    "rlctl/task/events/event.py: Steps",  # for task authors
+    "rlctl/checking/experiments/batches.py: Rows",
+    "rlctl/checking/experiments/goals.py: Source",
+    "rlctl/checking/experiments/held.py: Rows",
+    "rlctl/checking/kept_state.py: Observed",
+    "rlctl/checking/rules/rl816_command_beyond_ctrlrange.py: BulletJoint",
+}
+
+
+def list_aliases(file: Path) -> list[str]:
+    """Return the names of a module that stand for types: `Array = NDArray[np.float64]`."""
+    found = []
+    for node in parse(file).body:
+        if isinstance(node, ast.Assign) and not isinstance(node.value, ast.Call):
+            names = [target.id for target in node.targets if isinstance(target, ast.Name)]
+            found += [name for name in names if re.fullmatch(r"[A-Z]\w*[a-z]\w*", name)]
+    return found
+
+
+def test_an_alias_of_a_type_is_not_the_name_of_a_class():
+    """`Rows` is a class of actors: indices of worlds, or rows of a table, have another name."""
+    texts = [file.read_text() for file in files("rlctl")]
+    classes = {name for text in texts for name in re.findall(r"^ *class (\w+)[(:]", text, re.MULTILINE)}
+    aliases = {(str(file.relative_to(ROOT)), name) for file in files("rlctl") for name in list_aliases(file)}
+    assert len(aliases) > 50
+    shared = {f"{file}: {name}" for file, name in aliases if name in classes}
+    assert shared - MAY_SHARE_A_NAME == set()
 
 
 def test_who_imports_torch():

@@ -13,12 +13,12 @@ import numpy as np
 import pydantic
 from gymnasium import spaces
 
-from rlctl.environments.dict_spaces import LARGEST_SPACE, format_space
+from rlctl.environments.dict_spaces import LARGEST_SPACE, SINGLE, format_space, split_space
 from rlctl.environments.driven_joints import describe_driven_joints, joint_name
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
 from rlctl.task.commands import CommandTerm
-from rlctl.task.history import Start
+from rlctl.task.history import HistoryStart
 from rlctl.task.joints import Joints
 from rlctl.task.layout import Layout
 from rlctl.task.terms import (
@@ -59,7 +59,7 @@ class EnvInfo(pydantic.BaseModel):
     observation_units: dict[str, str] = {}
     observation_history: dict[str, int] = {}
     """Number of last values, oldest first, of the observations that are histories; their sizes include all."""
-    history_start: Start = "first"  # what fills histories when an episode begins
+    history_start: HistoryStart = "first"  # what fills histories when an episode begins
     observation_terms: dict[str, AnyTerm] = {}  # observations that are computed from measured quantities
     quantity_sizes: dict[str, int] = {}
     """Size per measured quantity of the terms, in the order of the terms and of their inputs."""
@@ -82,6 +82,17 @@ class EnvInfo(pydantic.BaseModel):
     def layout(self) -> Layout:
         """Where its named observations, and the values of their histories, are in the flat one."""
         return Layout(self.observation_sizes, self.observation_history)
+
+    def find_sizes(self, frames: int = 1) -> dict[str, int]:
+        """Return the elements of each named observation, or key of a Dict, in one of the `frames` of a stack.
+
+        Where the names are unknown, all elements are `observation`.
+        """
+        parts = split_space(self.spaces()[0])
+        of_keys = {key: math.prod(part.shape or ()) for key, part in parts.items()}
+        total = sum(of_keys.values()) // frames
+        sizes = dict(self.observation_sizes) if SINGLE in parts else of_keys
+        return sizes if sum(sizes.values()) == total else {"observation": total}
 
     def find_difference(self, other: EnvInfo, whose: str = "the environment's") -> str | None:
         """Describe how the spaces of `other` differ from these; None if they are equal."""

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rlctl.environments.dict_spaces import SINGLE, split_space
+from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import AnswerIsNo, UsageError, short_repr
 from rlctl.exporting.c_network import list_functions, write_action, write_network
 from rlctl.policy import own_modules
@@ -66,15 +66,11 @@ class CFunction:
         self.type = _NUMBERS[observation_type(info.env).name]
         self.action_type = _NUMBERS.get(action_type(info.env).name, "int")
         self.action_size = math.prod(self.action_space.shape or ())
-        self.observed = self._list_observed()
+        units = info.env.observation_units
+        self.observed = [
+            Element(name, size, units.get(name, "")) for name, size in info.env.find_sizes(self.frames).items()
+        ]
         self.actions = self._list_actions()
-
-    def _list_observed(self) -> list[Element]:
-        env = self.info.env
-        sizes = env.observation_sizes if SINGLE in self.parts else self.sizes
-        if sum(sizes.values()) != self.size:
-            sizes = {"observation": self.size}
-        return [Element(name, size, env.observation_units.get(name, "")) for name, size in sizes.items()]
 
     def _list_actions(self) -> list[Element]:
         joints = self.info.env.joints

@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
-import shlex
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlctl import output
 from rlctl.engine import Engine
-from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvChanges
-from rlctl.errors import AnswerIsNo, ArtifactError, TaskError, UsageError
+from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.export_request import ExportRequest
-from rlctl.exporting.verify import EPISODES, MAX_DIFFERENCE, Agreement, ClosedLoop, Latency, measure_latency, verify
+from rlctl.exporting.exported_policy import check_environment, explain_unverifiable, find_source
+from rlctl.exporting.report import ExportReport, check_verified, describe_policy
+from rlctl.exporting.report import show as show  # the command takes both from here
+from rlctl.exporting.verify import EPISODES, measure_latency, verify
 from rlctl.hub import store
 from rlctl.play.workers import Workers, count_envs
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import check_playable
 from rlctl.policy.own_modules import KEYS, import_named
-from rlctl.policy.shipped import PRETRAINED
-from rlctl.runs import lookup
-from rlctl.runs.directory import refuse_links_out
 from rlctl.runs.lookup import FoundPolicy
 from rlctl.storage import files
 
@@ -38,109 +34,6 @@ if TYPE_CHECKING:
     from rlctl.policy.torch_policy import TorchActor
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ExportReport:
-    """A file that was exported, and how it was verified."""
-
-    path: Path
-    policy: Path
-    task: str
-    algo: str
-    training_steps: int
-    size: int  # [bytes]
-    details: Mapping[str, Any]  # JSON entries that only this format has
-    agreement: Agreement | None = None
-    closed_loop: ClosedLoop | None = None
-    latency: Latency | None = None
-    not_verified: str = ""  # why it was not verified; empty if it was
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the report as plain data."""
-        result = {**dataclasses.asdict(self), **self.details, "verified": not self.not_verified}
-        del result["details"]
-        if self.agreement and self.latency:
-            result |= {name: getattr(self.agreement, name) for name in ("max_difference", "observations")}
-            result["latency"]["speedup"] = self.latency.speedup
-        return result
-
-    def check(self) -> None:
-        """Raise `AnswerIsNo` if the file was not verified."""
-        if self.not_verified:
-            raise AnswerIsNo(f"{self.path}: not verified: {self.not_verified}")
-
-    def list_rows(self) -> list[tuple[str, str]]:
-        """Return the lines of the report: pairs of a word and a text."""
-        details, size = self.details, f"{self.size / 1000:,.1f} kB"
-        if "opset" in details:
-            exported, following = f"{self.path} ({size}, opset {details['opset']})", ["rlctl", "eval", str(self.path)]
-            following += ["--task", self.task]
-            interface = [(kind, ", ".join(map(_format_port, details[kind]))) for kind in ("inputs", "outputs")]
-        else:
-            exported, following = f"{self.path} and {details['header'].name} ({size}, C99)", ["cc", "-std=c99"]
-            following += ["-O3", "-c", str(self.path)]
-            interface = [("function", details["prototype"])]
-        policy = f"{self.algo} for {self.task}, {self.training_steps:,} steps, from {self.policy}"
-        verification = [("not verified", self.not_verified)]
-        if self.agreement and self.closed_loop and (latency := self.latency):
-            times = f"{latency.exported_us:.1f} us for one observation; SB3 {latency.sb3_us:.1f} us"
-            verification = [
-                ("verified", format_agreement(self.agreement)),
-                ("closed loop", format_closed_loop(self.closed_loop)),
-                ("latency", f"{times}, {latency.speedup:.1f}x"),
-            ]
-        return [("exported", exported), ("policy", policy), *interface, *verification, ("next", shlex.join(following))]
-
-
-def _format_port(port: Mapping[str, Any]) -> str:
-    return f"{port['name']} {port['dtype']}[{', '.join(map(str, port['shape']))}]"
-
-
-def show(reports: list[ExportReport], json: str | None) -> None:
-    """Print the reports of one policy, or write them as JSON to a file or, for `-`, to stdout.
-
-    The JSON of one report is an object. Several reports are an object with an entry per format, `onnx` and `c`.
-    """
-    by_format = {report.path.suffix[1:]: report.as_json() for report in reports}
-    if output.present(by_format if len(reports) > 1 else reports[0].as_json(), json):
-        return
-    from rich.text import Text
-
-    for number, report in enumerate(reports):
-        if number:
-            output.out().print()
-        rows = [(Text(name, style="bold"), text) for name, text in report.list_rows()]
-        output.print_table(("", ""), rows, left=("",))
-
-
-def format_agreement(agreement: Agreement) -> str:
-    """Return the comparison on observations as one line."""
-    sizes = " and ".join(str(size) for size in agreement.batch_sizes)
-    text = (
-        f"max |difference| {agreement.max_difference:.1e} (limit {MAX_DIFFERENCE:.0e}) "
-        f"on {agreement.observations:,} observations, batches of {sizes}"
-    )
-    if agreement.beyond_limit:
-        text += f"; {agreement.beyond_limit:,} actions beyond the limit"
-    if agreement.near_ties:
-        text += f"; {agreement.near_ties:,} different choices between nearly equal logits"
-    return text
-
-
-def format_closed_loop(loop: ClosedLoop) -> str:
-    """Return the comparison of whole episodes as one line."""
-    episodes = output.format_count(loop.episodes, "episode")
-    if not loop.repeats:
-        return "cannot be compared: the environment does not repeat its own episodes (check-env)"
-    success = "" if loop.same_success is None else f"same success in {loop.same_success}, "
-    text = (
-        f"{episodes}: {success}same length in {loop.same_length}, return within {loop.max_return_difference:.1e} "
-        f"(mean {loop.mean_return:.5g} and {loop.mean_return_exported:.5g})"
-    )
-    if loop.magnified:
-        text += "; the episodes are chaotic: a change in the last bits makes the original policy differ as much"
-    return text
-
-
 def export_policy(request: ExportRequest) -> list[ExportReport]:
     """Export a policy in one or more formats and verify each file in the policy's own environment.
 
@@ -149,21 +42,6 @@ def export_policy(request: ExportRequest) -> list[ExportReport]:
     """
     source, target = find_source(request, "policy")
     return _export(source, [target.with_suffix(f".{name}") for name in request.formats], request.sim)
-
-
-def find_source(request: ExportRequest, name: str) -> tuple[FoundPolicy, Path]:
-    """Return the policy to export, and the path of the files without their suffixes, which end in `name` by default."""
-    source, target = lookup.find_policy(request.run, request.checkpoint), request.output
-    output.print_notes(source.notes)
-    if source.file.suffix == ".onnx":
-        raise UsageError(f"{source.file} is an ONNX file already; export the run or its .safetensors file")
-    if target is None:
-        if source.run is not None:
-            refuse_links_out(source.run.path)
-        folder = Path() if request.checkpoint == PRETRAINED else source.file.parent
-        stem = source.file.name if name == "policy" else f"{source.file.stem}-{name}.c"
-        target = source.run.onnx_file.with_stem(name) if source.run else folder / stem
-    return source, target
 
 
 def _export(source: FoundPolicy, targets: list[Path], sim: Engine) -> list[ExportReport]:
@@ -201,21 +79,6 @@ def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) ->
     except (UsageError, TaskError) as error:
         raise explain_unverifiable(policy_file, error) from None
     check_environment(policy_file, info, built)
-
-
-def explain_unverifiable(policy_file: Path, error: UsageError | TaskError) -> UsageError | TaskError:
-    """Return the error for an environment that does not build."""
-    message = f"{policy_file}: the export cannot be verified, because its environment does not build: {error}"
-    return type(error)(message, details=error.details)
-
-
-def check_environment(policy_file: Path, info: PolicyInfo, built: EnvInfo) -> None:
-    """Raise `ArtifactError` if a policy's environment has changed since its training."""
-    if difference := info.env.find_difference(built):
-        raise ArtifactError(
-            f"{policy_file}: the export cannot be verified, because its environment has changed: {difference}; "
-            "train again, or restore the task's previous version"
-        )
 
 
 def _export_onnx(policy: TorchActor, workers: Workers, target: Path, model: onnx.ModelProto) -> ExportReport:
@@ -257,24 +120,6 @@ def _export_c(policy: TorchActor, workers: Workers, target: Path, code: CSource)
     size = len(code.source.encode()) + len(code.header.encode())
     details = {"header": header, "prototype": code.prototype, "compiler": (compiler or [""])[0]}
     return ExportReport(**describe_policy(policy, target), **fields, size=size, details=details)
-
-
-def describe_policy(policy: TorchActor, target: Path) -> dict[str, Any]:
-    """Return the fields of a report that describe the policy and the file."""
-    info = policy.info
-    about = {"task": info.spec.task, "algo": info.algo, "training_steps": info.training_steps}
-    return {"path": target, "policy": policy.file.path, **about}
-
-
-def check_verified(path: Path, policy: Path | None, agreement: Agreement, loop: ClosedLoop) -> None:
-    """Raise `AnswerIsNo` for a file at `path` that acts otherwise than the policy."""
-    if agreement.agrees and (loop.agrees or not loop.is_conclusive):
-        return
-    why = f"it does not act as {policy} does"
-    if agreement.agrees:
-        why = "all actions agree, but the episodes differ"
-    numbers = f"{format_agreement(agreement)}\n{format_closed_loop(loop)}"
-    raise AnswerIsNo(f"{path}: not verified, not written: {why}\n{numbers}")
 
 
 def _verify(

@@ -15,8 +15,9 @@ from rlctl.evaluation import junit as evaluation_junit
 from rlctl.evaluation.eval_request import NO_GATES, EvalRequest, Gates
 from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.evaluation.players import find_player
-from rlctl.exporting.export import ExportReport, export_policy
+from rlctl.exporting.export import export_policy
 from rlctl.exporting.export_request import ExportRequest, Format
+from rlctl.exporting.report import ExportReport
 from rlctl.runs import lookup
 from rlctl.runs.compare.comparison import NOT_WORSE, ComparisonGate, RunComparison, compare
 from rlctl.runs.compare.significance import Verdict

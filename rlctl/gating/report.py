@@ -9,7 +9,7 @@ from rlctl.checking.check import CheckReport
 from rlctl.evaluation import report as evaluation_report
 from rlctl.evaluation.eval_request import NO_GATES
 from rlctl.evaluation.evaluate import Evaluation
-from rlctl.exporting import export
+from rlctl.exporting import report as export_report
 from rlctl.gating.gate import GateReport, Result
 from rlctl.runs.compare import report as comparison_report
 from rlctl.runs.compare.comparison import RunComparison
@@ -28,7 +28,7 @@ def show_step(result: object) -> None:
     elif isinstance(result, RunComparison):
         comparison_report.show(result, None)
     elif isinstance(result, list):
-        export.show(result, None)
+        export_report.show(result, None)
     output.out().print()
 
 

@@ -96,7 +96,7 @@ def play_episodes(
     while running:
         before = workers.playing
         try:
-            results = workers.finish_playing(first=True, check=lambda: watch(len(episodes)))
+            results = workers.finish_playing(first=True, watch=lambda: watch(len(episodes)))
         except EpisodeFailed as error:
             if record and error.env in running:
                 error.actions = running[error.env].failed_actions(workers, error)

@@ -11,11 +11,12 @@ from rlctl.environments.dict_spaces import SINGLE, join, split
 from rlctl.errors import TaskError, describe_exception, format_plugin_traceback
 from rlctl.play import messages
 from rlctl.play.messages import EpisodeResult, FailedInEpisode
-from rlctl.play.playing import Index, Playing, RecordedActions
+from rlctl.play.playing import Playing, RecordedActions, Worlds
 from rlctl.play.seeds import list_training_seeds
 from rlctl.play.shared_arrays import CRITIC, SharedArrays
 from rlctl.policy.actor import Actor, Array, Rows
 from rlctl.printed_lines import print_line
+from rlctl.task.world_index import WorldIndex
 
 
 class Episodes:
@@ -25,14 +26,14 @@ class Episodes:
     """
 
     def __init__(
-        self, worlds: Any, first: int, row: int = 0, *, has_critic: bool = False, teacher: Actor | None = None
+        self, worlds: Worlds, first: int, row: int = 0, *, has_critic: bool = False, teacher: Actor | None = None
     ) -> None:
         self.worlds, self.first, self.teacher = worlds, first, teacher
         self._row = row
         self._has_critic = has_critic
-        self._playing = Playing(worlds)
-        self._time = np.zeros((worlds.count, 2))  # of policy and environment in each episode [s]
-        self._deepest = np.full(worlds.count, np.nan)  # how far bodies overlapped at most [m]; NaN: not measured
+        self.playing = Playing(worlds)
+        self.times_s = np.zeros((worlds.count, 2))  # of policy and environment in each episode [s]
+        self.deepest = np.full(worlds.count, np.nan)  # how far bodies overlapped at most [m]; NaN: not measured
 
     @property
     def envs(self) -> range:
@@ -41,7 +42,7 @@ class Episodes:
 
     def _fail(self, error: BaseException, world: int) -> NoReturn:
         world = getattr(error, "world", world)  # of `WorldFailed` and `in_world`
-        seed, step = int(self._playing.seeds[world]), int(self.worlds.step_of[world])
+        seed, step = int(self.playing.seeds[world]), int(self.worlds.step_of[world])
         raise FailedInEpisode(self.first + world, seed, step) from error
 
     def row_of(self, world: int) -> int:
@@ -52,10 +53,10 @@ class Episodes:
         """Return rows of worlds as those of actors."""
         return Rows(rows.index + self._row, rows.seed, rows.step) if self._row else rows
 
-    def begin_rows(self, actor: Actor | None, index: Index) -> None:
+    def begin_rows(self, actor: Actor | None, index: WorldIndex) -> None:
         """Let an actor begin the episodes of worlds."""
         if actor is not None:
-            actor.begin(self.as_rows(self._playing.select(index)))
+            actor.begin(self.as_rows(self.playing.select(index)))
 
     def teach(self, rows: Rows) -> Any:
         """Return the teacher's actions in the present step; None without a teacher. Call it at every step."""
@@ -63,33 +64,34 @@ class Episodes:
             return None
         return self.teacher.act(self.worlds.teacher_sees(rows.index), self.as_rows(rows))[1]
 
-    def _begin(self, arrays: SharedArrays, index: Index, seeds: Sequence[int]) -> dict[str, Any]:
+    def begin(self, arrays: SharedArrays, index: WorldIndex, seeds: Sequence[int]) -> dict[str, Any]:
         """Begin episodes; return their first observations by key, with what only the critic sees."""
-        self._time[index] = 0.0
-        self._deepest[index] = np.nan
+        self.times_s[index] = 0.0
+        self.deepest[index] = np.nan
         envs = self.first + index
-        arrays.inside[envs, 0], arrays.inside[envs, 1] = seeds, 0
-        self._playing.seeds[index] = seeds
+        arrays.call_seed[envs], arrays.call_step[envs] = seeds, 0
+        self.playing.seeds[index] = seeds
         self.worlds.step_of[index] = 0
         self.worlds.shorten(index, arrays.limit[envs])
         try:
-            return self._show(self._playing.begin(index, seeds, arrays.level[envs]), index)
+            return self.show(self.playing.begin(index, seeds, arrays.level[envs]), index)
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(index[0]))
 
-    def _show(self, observations: Any, index: Index) -> dict[str, Any]:
+    def show(self, observations: Any, index: WorldIndex) -> dict[str, Any]:
+        """Return observations by key, with what only the critic sees."""
         parts: dict[str, Any] = split(observations)
         if self._has_critic:
             parts = {**parts, CRITIC: self.worlds.observe_privileged(index)}
         return parts
 
-    def replay(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
-        """Begin episodes and replay their actions; return the environments whose episode ended or failed."""
+    def repeat(self, arrays: SharedArrays, asked: messages.BeginEpisodes) -> list[int]:
+        """Begin episodes and repeat their actions; return the environments whose episode ended or failed."""
         left: list[int] = []
         episodes = {env: asked.episodes[env] for env in self.envs if env in asked.episodes}
         while episodes:
             try:
-                return left + self._replay(arrays, episodes)
+                return left + self._repeat(arrays, episodes)
             except FailedInEpisode as failure:
                 if not asked.may_fail:
                     raise
@@ -99,30 +101,31 @@ class Episodes:
                 print_line(f"{failure} when it was replayed")
         return left
 
-    def _replay(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> list[int]:
+    def _repeat(self, arrays: SharedArrays, episodes: Mapping[int, tuple[int, NDArray[Any]]]) -> list[int]:
         """Take the recorded actions in lockstep; return the environments whose episode ended."""
         index = np.array([*episodes], np.int64) - self.first
-        shown = self._begin(arrays, index, [seed for seed, _ in episodes.values()])
-        self._write_current(arrays, index, shown)
+        shown = self.begin(arrays, index, [seed for seed, _ in episodes.values()])
+        self.write_current(arrays, index, shown)
         actions = {env - self.first: taken for env, (_, taken) in episodes.items()}
         lengths = np.array([len(actions.get(world, ())) for world in range(self.worlds.count)])
         has_actions = lengths[index] > 0
         first = {key: part[has_actions] for key, part in shown.items() if key != CRITIC}
-        recorder = _Replayer(RecordedActions(actions), self, arrays)
+        repeater = _Repeater(RecordedActions(actions), self, arrays)
         self.begin_rows(self.teacher, index)
         left: list[int] = []
         try:
-            for played in self._playing.play(recorder, index[has_actions], join(first)):
+            for played in self.playing.play(repeater, index[has_actions], join(first)):
                 index = played.index
-                self._write_current(arrays, index, self._show(played.result.observation, index))
+                self.write_current(arrays, index, self.show(played.result.observation, index))
                 left += (played.ended + self.first).tolist()
-                self._playing.stop(index[self.worlds.step_of[index] >= lengths[index]])
+                self.playing.stop(index[self.worlds.step_of[index] >= lengths[index]])
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(index[0]))
-        arrays.inside[self.first : self.first + self.worlds.count, 1] = -1
+        arrays.call_step[self.first : self.first + self.worlds.count] = -1
         return left
 
-    def _write_current(self, arrays: SharedArrays, index: Index, shown: Mapping[str, Any]) -> None:
+    def write_current(self, arrays: SharedArrays, index: WorldIndex, shown: Mapping[str, Any]) -> None:
+        """Write the present observations of worlds, by key."""
         for key, part in shown.items():
             arrays.observation[key][self.first + index] = part
 
@@ -133,14 +136,14 @@ class Episodes:
         index = np.array(sorted(begin), np.int64) - self.first
         segment = _Segment(self, arrays, asked, actor)
         try:
-            return segment.play(index, np.array([begin[self.first + world] for world in index.tolist()], np.int64))
+            return segment.write(index, np.array([begin[self.first + world] for world in index.tolist()], np.int64))
         except FailedInEpisode:
             raise
         except BaseException as error:  # a plugin may raise anything, SystemExit too
             self._fail(error, int(segment.index[0]))
 
 
-class _Replayer(Actor):
+class _Repeater(Actor):
     """An actor that acts as another, and lets the teacher see every step: it may have a recurrent state."""
 
     def __init__(self, actor: RecordedActions, episodes: Episodes, arrays: SharedArrays) -> None:
@@ -149,22 +152,21 @@ class _Replayer(Actor):
     def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
         """Return the actor's actions."""
         self._episodes.teach(rows)
-        self._arrays.inside[self._episodes.first + rows.index, 1] = rows.step + 1
+        self._arrays.call_step[self._episodes.first + rows.index] = rows.step + 1
         return self._actor.act(observations, rows)
 
 
 class _Segment(Actor):
-    """A segment that is played and written; as an actor it writes what was chosen before the worlds step."""
+    """Writes a segment: as an actor what was chosen, before the worlds step; in `write` what they returned."""
 
     def __init__(self, episodes: Episodes, arrays: SharedArrays, asked: messages.Play, actor: Actor) -> None:
         self._episodes, self._arrays, self._asked, self._actor = episodes, arrays, asked, actor
         self._worlds, self._first = episodes.worlds, episodes.first
         own = slice(self._first, self._first + self._worlds.count)
         self._segment = arrays.segment.by_step(own)  # arrays of shape (steps, worlds, ...)
-        self._inside = arrays.inside[own]
-        self._steps, self._rows = self._inside[:, 1], self._inside[:, 2]
+        self._steps, self._rows = arrays.call_step[own], arrays.call_row[own]
         self._ones = np.ones(self._worlds.count, np.int64)
-        self.index: Index = np.zeros(1, np.int64)  # the worlds that play, for errors
+        self.index: WorldIndex = np.zeros(1, np.int64)  # the worlds that play, for errors
         self._row = 0
         self._acting_s = self._stepping_s = 0.0  # since the worlds that play changed last
         self._acted_s = 0.0  # when the last action was chosen
@@ -176,28 +178,28 @@ class _Segment(Actor):
         contacts = [env - self._first for env in asked.contacts if env in episodes.envs]
         self._contacts = np.array(contacts, np.int64)
 
-    def _at(self, row: int, index: Index) -> Any:
+    def _at(self, row: int, index: WorldIndex) -> Any:
         """Return the place of some worlds in a row of arrays; NumPy is fastest where the whole row is meant."""
         if len(index) == self._worlds.count:
             return row
         return row, index
 
-    def play(self, index: Index, seeds: NDArray[np.int64]) -> list[EpisodeResult]:
-        """Begin the episodes whose seeds are not negative, and play."""
+    def write(self, index: WorldIndex, seeds: NDArray[np.int64]) -> list[EpisodeResult]:
+        """Begin the episodes whose seeds are not negative, play, and write what the worlds return."""
         arrays, asked, segment = self._arrays, self._asked, self._segment
-        episodes, playing = self._episodes, self._episodes._playing
+        episodes, playing = self._episodes, self._episodes.playing
         self.index = index
         new = index[seeds >= 0]
         if len(new):
-            shown = episodes._begin(arrays, new, seeds[seeds >= 0].tolist())
-            episodes._write_current(arrays, new, shown)
+            shown = episodes.begin(arrays, new, seeds[seeds >= 0].tolist())
+            episodes.write_current(arrays, new, shown)
             episodes.begin_rows(self._actor, new)
             episodes.begin_rows(episodes.teacher, new)
         envs = self._first + index
         for key, part in segment.observation.items():
             part[0, index] = arrays.observation[key][envs]
         first = {key: part[envs] for key, part in arrays.observation.items() if key != CRITIC}
-        self._inside[index, 0] = playing.seeds[index]
+        arrays.call_seed[envs] = playing.seeds[index]
         observations = segment.observation.items()
         only = segment.observation[SINGLE] if list(segment.observation) == [SINGLE] else None
         segment.terminated[:, index], segment.truncated[:, index] = False, False
@@ -217,7 +219,7 @@ class _Segment(Actor):
             if only is not None:
                 only[after] = result.observation
             else:
-                shown = episodes._show(result.observation, played.index)
+                shown = episodes.show(result.observation, played.index)
                 for key, part in observations:
                     part[after] = shown[key]
             if len(self._contacts):
@@ -235,7 +237,7 @@ class _Segment(Actor):
         # In the order of environments that play one after the other.
         return sorted(self._ended, key=lambda ended: ended.env)
 
-    def _keep_last(self, index: Index) -> None:
+    def _keep_last(self, index: WorldIndex) -> None:
         for key, part in self._segment.observation.items():
             self._arrays.observation[key][self._first + index] = part[self._row, index]
 
@@ -243,7 +245,7 @@ class _Segment(Actor):
         """Add the times since the last call to those of the episodes that play, each its share."""
         if len(self.index):
             share = 1.0 / len(self.index)
-            self._episodes._time[self.index] += self._acting_s * share, self._stepping_s * share
+            self._episodes.times_s[self.index] += self._acting_s * share, self._stepping_s * share
         self._acting_s = self._stepping_s = 0.0
 
     def act(self, observations: Any, rows: Rows) -> tuple[Array, Array]:
@@ -266,11 +268,11 @@ class _Segment(Actor):
         return stored, action
 
     def _measure_contacts(self) -> None:
-        deepest = self._episodes._deepest
+        deepest = self._episodes.deepest
         for world in np.intersect1d(self.index, self._contacts).tolist():
             deepest[world] = np.fmax(deepest[world], self._worlds.deepest_contact(world))
 
-    def _finish(self, ended: Index) -> None:
+    def _finish(self, ended: WorldIndex) -> None:
         """Note the episodes that ended in some worlds, and begin those that follow them."""
         arrays, asked, segment, row = self._arrays, self._asked, self._segment, self._row
         self._note_times()
@@ -289,7 +291,7 @@ class _Segment(Actor):
                     arrays.level[result.env] = self._find_next_level(asked.levels, result)
         arrays.limit[envs] = 0  # only the first episodes are short
         self._rows[ended] = row + 1
-        shown = self._episodes._begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
+        shown = self._episodes.begin(arrays, ended, [next(self._seeds[env]) for env in envs.tolist()])
         for key, part in shown.items():
             segment.observation[key][row + 1, ended] = part
         self._episodes.begin_rows(self._actor, ended)
@@ -303,11 +305,11 @@ class _Segment(Actor):
 
     def _summarize(self, world: int) -> EpisodeResult:
         totals = self._worlds.totals(world)
-        acting, stepping = self._episodes._time[world].tolist()
-        deepest = float(self._episodes._deepest[world])
+        acting, stepping = self._episodes.times_s[world].tolist()
+        deepest = float(self._episodes.deepest[world])
         return EpisodeResult(
             env=self._first + world,
-            seed=int(self._episodes._playing.seeds[world]),
+            seed=int(self._episodes.playing.seeds[world]),
             total_reward=totals.reward,
             length=int(self._worlds.step_of[world]),
             success=totals.success,

@@ -70,7 +70,7 @@ class Attach:
 
 @dataclasses.dataclass(frozen=True)
 class BeginEpisodes:
-    """Begin episodes and replay actions in them."""
+    """Begin episodes and repeat actions in them."""
 
     episodes: dict[int, tuple[int, NDArray[Any]]]  # per environment the seed, and the actions, shape (steps, ...)
     may_fail: bool = False  # whether an episode that fails is treated as one that ended; else its error is raised
@@ -168,7 +168,7 @@ class Answer:
     """The answer of a worker; it contains only what the message asks for."""
 
     ended: Sequence[EpisodeResult] = ()  # episodes that ended while a segment was played
-    left: Sequence[int] = ()  # environments whose episode ended or failed while its actions were replayed
+    left: Sequence[int] = ()  # environments whose episode ended or failed while its actions were repeated
     info: EnvInfo | None = None  # description of the environments, if it has changed
     lockstep: bool = False  # whether they are the worlds of a `BatchTask`, which play together
     shared_world: SharedWorld | None = None  # of environments that were built

@@ -4,50 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rlctl.environments.dict_spaces import map_parts, split
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.policy.actor import Actor, Array, Rows, act_one_by_one
-from rlctl.task.worlds import EpisodeTotals, WorldsStep
+from rlctl.task.world_index import WorldIndex
+from rlctl.task.worlds import TaskWorlds, WorldsStep
 
-Index = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-class Worlds(Protocol):
-    """`count` worlds, each with its own episode; a task or a Gymnasium environment. All arrays have a row per world."""
-
-    count: int
-    action_space: spaces.Space[Any]
-    step_of: Index
-    """Steps since the start of each world's episode, the one that runs included; shape (count,)."""
-
-    def reset(self, worlds: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
-        """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...)."""
-
-    def shorten(self, worlds: Index, limits: Index) -> None:
-        """Truncate the next episodes of some worlds after so many steps, or after the task's time limit where it is 0;
-        only worlds of a task can."""
-
-    def step(self, action: Any, worlds: Index | None = None) -> WorldsStep:
-        """Advance some worlds by a step; `action` has a row for each, shape (k, ...)."""
-
-    def totals(self, world: int) -> EpisodeTotals:
-        """Return what the running episode of a world has added up to."""
+Worlds = TaskWorlds | GymWorlds
+"""`count` worlds, each with its own episode, of a task or a Gymnasium environment. All arrays have a row per world."""
 
 
 @dataclasses.dataclass(slots=True)
 class Played:
-    """A step of some worlds."""
+    """A step of some worlds.
 
-    index: Index  # of the worlds, shape (k,)
+    It is valid until the next one. `Playing.begin` writes the first observation of an episode over the last one of the
+    episode before, in `result.observation`.
+    """
+
+    index: WorldIndex  # of the worlds, shape (k,)
     action: Any
     result: WorldsStep
-    ended: Index  # the worlds whose episode has ended
+    ended: WorldIndex  # the worlds whose episode has ended
 
 
 class NoMoreActions(Exception):
@@ -59,31 +45,33 @@ class Playing:
 
     def __init__(self, worlds: Worlds) -> None:
         self.worlds = worlds
-        self.seeds: Index = np.full(worlds.count, -1, np.int64)  # of the episode of each world
-        self._none: Index = np.zeros(0, np.int64)
+        self.seeds: NDArray[np.int64] = np.full(worlds.count, -1, np.int64)  # of the episode of each world
+        self._has_begun: Flags = np.zeros(worlds.count, bool)  # in which worlds an episode has followed the ended one
+        self._none: WorldIndex = np.zeros(0, np.int64)
         self._index = self._none  # the worlds that play
         self._observations: Any = None  # of these, before their next action
 
-    def begin(self, index: Index, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
+    def begin(self, index: WorldIndex, seeds: Sequence[int], levels: NDArray[np.float64] | None = None) -> Any:
         """Begin the episodes of `seeds` in some worlds; return their first observations, shape (k, ...).
 
         In the loop of `play` they follow on episodes that ended.
         """
         self.seeds[index] = seeds
         first = self.worlds.reset(index, seeds, levels)
+        self._has_begun[index] = True
         if len(self._index):
             at = np.searchsorted(self._index, index)
             for key, part in split(self._observations).items():
                 part[at] = split(first)[key]
         return first
 
-    def select(self, index: Index) -> Rows:
+    def select(self, index: WorldIndex) -> Rows:
         """Return some worlds as rows."""
         if len(index) == self.worlds.count:
             return Rows(index, self.seeds, self.worlds.step_of)
         return Rows(index, self.seeds[index], self.worlds.step_of[index])
 
-    def play(self, actor: Actor, index: Index, observations: Any) -> Iterator[Played]:
+    def play(self, actor: Actor, index: WorldIndex, observations: Any) -> Iterator[Played]:
         """Continue the episodes of worlds, in ascending order, whose `observations` are given; yield each step.
 
         An episode that ends leaves, unless another has begun there. `NoMoreActions` from the actor ends the loop; other
@@ -102,13 +90,14 @@ class Playing:
                 ended = self._none
                 if True in result.terminated.tolist() or True in result.truncated.tolist():  # faster than NumPy's any
                     ended = rows.index[result.terminated | result.truncated]
+                    self._has_begun[ended] = False
                 yield Played(rows.index, action, result, ended)
                 if len(ended):
-                    self.stop(ended[self.worlds.step_of[ended] > 0])
+                    self.stop(ended[~self._has_begun[ended]])
         finally:
             self._index = self._none
 
-    def stop(self, worlds: Index) -> None:
+    def stop(self, worlds: WorldIndex) -> None:
         """Let some worlds play no further."""
         staying = np.isin(self._index, worlds, invert=True)
         if not staying.all():

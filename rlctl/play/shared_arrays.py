@@ -85,6 +85,7 @@ class SharedArrays:
         self.inside = arrays["inside"]
         """Episode seed, step and row of the segment during a call of each environment, shape (n_envs, 3); errors name
         them if a worker dies or hangs. Step 0 is the reset; the step is negative outside of calls."""
+        self.call_seed, self.call_step, self.call_row = self.inside.T  # its columns, which share memory with it
         self.level = arrays["level"]
         """How hard the episode of each environment is, or the next one that begins, from 0 to 1; shape (n_envs,)."""
         self.limit = arrays["limit"]

@@ -15,6 +15,7 @@ import numpy as np
 
 from rlctl.environments.bullet_calls import BulletCall, record_calls
 from rlctl.environments.bullet_clients import find_clients
+from rlctl.environments.gym_worlds import GymWorlds
 from rlctl.environments.registry import is_task
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import TaskError
@@ -60,7 +61,7 @@ def _read_own_memory() -> int:
     return 0
 
 
-def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Any, SharedWorld | None]:
+def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Worlds, SharedWorld | None]:
     """Build one world and try it for a few steps; return it, and how it shares its world with others, or None.
 
     Tasks of rlctl and environments without PyBullet are only built. An error in the trial is left to the first episode.
@@ -69,7 +70,8 @@ def make_watched(spec: EnvSpec, teacher: EnvSpec | None = None) -> tuple[Any, Sh
         return spec.make_worlds(1, teacher=teacher), None
     before = set(find_clients())
     with record_calls(with_results=()) as calls:
-        worlds: Any = spec.make_worlds(1, teacher=teacher)
+        worlds = spec.make_worlds(1, teacher=teacher)
+    assert isinstance(worlds, GymWorlds)  # those of a task are above
     if "pybullet" not in sys.modules or not {*find_clients(), *before}:
         return worlds, None
     with record_calls(with_results=()) as later:

@@ -2,17 +2,17 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.wrappers import NAME as TIME_LEFT
 from rlctl.errors import ArtifactError
 from rlctl.play import messages
+from rlctl.play.playing import Worlds
 from rlctl.policy.file import PolicyInfo
 from rlctl.policy.load import load_policy
 
 
-def check_teacher(teacher: messages.LabellingPolicy, worlds: Any) -> None:
+def check_teacher(teacher: messages.LabellingPolicy, worlds: Worlds) -> None:
     """Raise `ArtifactError` if a teacher does not fit what worlds show it."""
     info = load_policy(Path(teacher.policy)).info
     observation_space, action_space = info.env.spaces()

@@ -22,6 +22,7 @@ from rlctl.library_output import print_whole_lines
 from rlctl.play import messages
 from rlctl.play.episodes import Episodes, compute_rewards
 from rlctl.play.messages import Answer, EpisodeResult, Message, describe_failure
+from rlctl.play.playing import Worlds
 from rlctl.play.shared_arrays import SharedArrays, map_arrays
 from rlctl.play.shared_world import make_watched
 from rlctl.play.teaching import check_teacher
@@ -59,7 +60,7 @@ class Worker:
             case messages.Play():
                 return Answer(ended=self._play(message))
             case messages.BeginEpisodes():
-                return Answer(left=[env for group in self._groups for env in group.replay(self._arrays, message)])
+                return Answer(left=[env for group in self._groups for env in group.repeat(self._arrays, message)])
             case messages.ComputeRewards():
                 return Answer(rewards=compute_rewards(self._groups[0].worlds, message.achieved, message.desired))
             case messages.Build():
@@ -109,7 +110,7 @@ class Worker:
             mirror=mirror,
         )
 
-    def _make_worlds(self, message: messages.Build) -> tuple[list[Any], messages.SharedWorld | None]:
+    def _make_worlds(self, message: messages.Build) -> tuple[list[Worlds], messages.SharedWorld | None]:
         """Build the worlds; only the first ones if environments in one process would share a PyBullet world."""
         spec, count = message.spec, self._job.count
         teacher = None if message.teacher is None else message.teacher.spec
@@ -194,12 +195,12 @@ class Worker:
         self._groups = []
 
 
-def find_task_worlds(worlds: TaskWorlds | GymWorlds) -> TaskWorlds | None:
+def find_task_worlds(worlds: Worlds) -> TaskWorlds | None:
     """Return the worlds of a task, also of one in wrappers; None for a plain environment."""
     return worlds.task_worlds if isinstance(worlds, GymWorlds) else worlds
 
 
-def show_critic(spec: EnvSpec, worlds: Any, privileged: Mapping[str, bool]) -> dict[str, int]:
+def show_critic(spec: EnvSpec, worlds: Worlds, privileged: Mapping[str, bool]) -> dict[str, int]:
     """Let worlds observe what only the critic sees; return its sizes by name, or raise `RecipeError`."""
     of_task, space = find_task_worlds(worlds), worlds.observation_space
     if of_task is None:

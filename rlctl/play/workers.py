@@ -191,9 +191,9 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
     def begin_episodes(
         self, episodes: Mapping[int, EpisodeSoFar], *, doing: str = "stepping", may_fail: bool = False
     ) -> set[int]:
-        """Begin episodes, environment index -> (seed, actions so far), and replay their actions.
+        """Begin episodes, environment index -> (seed, actions so far), and repeat their actions.
 
-        Return the environments whose episode ended during the replay; with `may_fail` also those whose episode failed,
+        Return the environments whose episode ended meanwhile; with `may_fail` also those whose episode failed,
         which raises otherwise. Errors mention `doing`.
         """
         dtype = self.arrays.segment.action.dtype
@@ -235,12 +235,12 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
         for worker, envs in self._by_worker(play.begin).items():
             self._send(worker, dataclasses.replace(play, begin={env: play.begin[env] for env in envs}))
 
-    def finish_playing(self, *, first: bool = False, check: Callable[[], None] | None = None) -> list[EpisodeResult]:
+    def finish_playing(self, *, first: bool = False, watch: Callable[[], None] | None = None) -> list[EpisodeResult]:
         """Wait for all playing workers, or for the `first`; return the episodes that ended, by environment and row.
 
-        `check` is called several times a second; an exception from it ends the wait.
+        `watch` is called several times a second; an exception from it ends the wait.
         """
-        answers = self._wait("stepping", first=first, check=check)
+        answers = self._wait("stepping", first=first, watch=watch)
         # In the order of the environments, so that results are reproducible.
         return [result for _, answer in sorted(answers.items()) for result in answer.ended]
 

@@ -84,19 +84,19 @@ class ProcessPool:
         timeout_s: float | None = None,
         *,
         first: bool = False,
-        check: Callable[[], None] | None = None,
+        watch: Callable[[], None] | None = None,
     ) -> dict[int, Any]:
         """Wait for the answers of all asked workers, or of the `first` ones; return them by worker.
 
-        A `WorkerException` is returned at once. `check` is called several times a second; an exception from it ends the
+        A `WorkerException` is returned at once. `watch` is called several times a second; an exception from it ends the
         wait. Raises `WorkerFault`, which mentions `doing`, if a worker dies or makes no progress for `timeout_s`.
         """
         answers: dict[int, Any] = {}
         standstill = Standstill(self._read_progress)
         left: float | None = timeout_s
         while self.waiting_for and not (first and answers):
-            if check is not None:
-                check()
+            if watch is not None:
+                watch()
                 left = _CHECK_EVERY_S if left is None else min(left, _CHECK_EVERY_S)
             connections = {self._processes[worker].connection: worker for worker in self.waiting_for}
             ready = wait(list(connections), timeout=left)

@@ -18,7 +18,7 @@ from rlctl.task.pybullet.library import pybullet
 from rlctl.task.rotations import from_axis, invert, multiply, normalize, rotate
 
 Array = NDArray[np.float64]
-Pose = tuple[tuple[float, ...], tuple[float, ...]]  # position [m], quaternion (x, y, z, w)
+BulletPose = tuple[tuple[float, ...], tuple[float, ...]]  # position [m], quaternion (x, y, z, w)
 Visuals = tuple[tuple[Any, ...], ...]  # what getVisualShapeData returns: link, kind, size, file, pose, colour
 
 _GROUND_SIZE = 8.0  # [m]; a flat body that is longer and wider is the ground
@@ -42,7 +42,7 @@ class BulletJoint:
     axis: tuple[float, ...]  # in the inertial frame of the link
     pivot: tuple[float, ...]  # position in the inertial frame of the parent [m]
     turn: tuple[float, ...]  # quaternion that turns the inertial frame of the parent into that of the link
-    inertial: Pose  # inertial frame in the link frame
+    inertial: BulletPose  # inertial frame in the link frame
 
     @property
     def moves(self) -> bool:
@@ -59,7 +59,7 @@ class BulletBody:
     name: str  # of the model; `body 3` if it has none
     links: list[str]  # unique names, the base first: link `i` of PyBullet is `links[i + 1]`
     joints: list[BulletJoint]  # one per link without the base
-    inertial: Pose  # inertial frame of the base in its link frame
+    inertial: BulletPose  # inertial frame of the base in its link frame
     mass: float  # of all links [kg]
     is_fixed: bool  # whether the base is fixed to the world
     is_soft: bool
@@ -182,7 +182,7 @@ def make_unique(names: Sequence[str]) -> list[str]:
     return unique
 
 
-def read_pose(body: BulletBody, link: int) -> Pose:
+def read_pose(body: BulletBody, link: int) -> BulletPose:
     """Return the pose of the inertial frame of `links[link]` in the world.
 
     That of a link which is not the base is from the beginning of the last physics step.
@@ -246,7 +246,7 @@ def _find_halves(kind: int, size: Sequence[float]) -> Array | None:
 class BodyState:
     """Where a body is."""
 
-    base: Pose  # inertial frame of the base in the world frame
+    base: BulletPose  # inertial frame of the base in the world frame
     joints: Sequence[tuple[tuple[float, ...], tuple[float, ...]]]  # positions and velocities of each joint
 
 

@@ -5,7 +5,7 @@ import math
 from rlctl.errors import ArtifactError
 from rlctl.policy.file import PolicyFile, Score
 from rlctl.runs.directory import RunDirectory
-from rlctl.runs.tables import Rows, read_table
+from rlctl.runs.tables import TableRows, read_table
 
 _STANDARD_ERRORS = 1.645
 """A success rate is lower beyond this many standard errors: 5 % of equal policies count as lower (one-sided)."""
@@ -36,7 +36,7 @@ def is_better(new: Score, best: Score | None, highest: float, episodes: float) -
     return (new.mean_return, new.success) > (best.mean_return, best.success)
 
 
-def find_best_row(rows: Rows) -> dict[str, float | None] | None:
+def find_best_row(rows: TableRows) -> dict[str, float | None] | None:
     """Return the evaluation that selected the training's best policy; None if no row has a return."""
     best_row, best_score, highest = None, None, 0.0
     for row in rows:

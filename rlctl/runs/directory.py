@@ -61,7 +61,7 @@ class RunDirectory:
     tensorboard = _RunPath("tensorboard")  # the folder of TensorBoard files
     tracking_file = _RunPath("tracking.json")  # the id in the experiment tracker, and what was sent to it
     onnx_file = _RunPath("exports/policy.onnx")  # the default file of an export
-    replay_segments = _RunPath("checkpoints/replay")  # the folder of the replay buffer that checkpoints share
+    replay_parts = _RunPath("checkpoints/replay")  # the folder of the replay buffer that checkpoints share
 
     def teacher_file(self, suffix: str) -> Path:
         """Return the file of the policy that a student was distilled from, `.safetensors` or `.onnx`."""
@@ -142,7 +142,7 @@ class RunDirectory:
 
     def recover(self) -> None:
         """Repair files that a killed process left incomplete; call it only while holding the lock."""
-        for folder in [self.path, *(path for path in self.path.glob("*") if path.is_dir()), self.replay_segments]:
+        for folder in [self.path, *(path for path in self.path.glob("*") if path.is_dir()), self.replay_parts]:
             files.recover(folder)
 
     def lock(self) -> RunLock:

@@ -9,11 +9,11 @@ from pathlib import Path
 from rlctl.errors import ArtifactError
 from rlctl.storage import untrusted
 
-Rows = list[dict[str, float | None]]  # of a table, oldest first; an empty field is None
+TableRows = list[dict[str, float | None]]  # of a table, oldest first; an empty field is None
 LARGEST = 1e100  # larger numbers are ignored: plots and sums would overflow
 
 
-def read_table(path: Path) -> Rows:
+def read_table(path: Path) -> TableRows:
     """Return a table's rows with numbers; rows cut short by a killed process or without numbers are left out.
 
     Infinite and absurdly large values are None. Raises `ArtifactError` for what is not a table.
@@ -41,7 +41,7 @@ def _numbers(row: dict[str, str]) -> dict[str, float | None] | None:
     return {name: value if value is not None and abs(value) < LARGEST else None for name, value in numbers.items()}
 
 
-def list_points(rows: Rows, column: str) -> list[tuple[float, float]]:
+def list_points(rows: TableRows, column: str) -> list[tuple[float, float]]:
     """Return the steps and the values of a column where it has finite ones."""
     pairs = ((row.get("steps"), row.get(column)) for row in rows)
     return [

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, UsageError, check_name
 from rlctl.task.joints import Joints
-from rlctl.task.motors import Motor, Motors
+from rlctl.task.motors import AnyMotors, Motor
 from rlctl.task.named_motors import find_motor
 from rlctl.task.rotations import roll_pitch_yaw
 
@@ -264,7 +264,7 @@ class Body:
         """
         self._refuse("set_drives")
 
-    def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
+    def set_motors(self, motors: AnyMotors, *, joints: Sequence[str] = (), **changes: Any) -> None:
         """Give joints real motors, with friction, voltage, backlash and delay. Call it in `build`; MuJoCo only.
 
         `motors` is a `Motor` or the name of one in `rlctl.task.named_motors`, for all joints or one per joint, or such
@@ -477,7 +477,7 @@ class Body:
         known = {name: [value for value in values if value is not None] for name, values in found.items()}
         return {name: values for name, values in known.items() if len(values) == len(joints)}
 
-    def _spread_motors(self, motors: Motors, joints: Sequence[str], changes: Mapping[str, Any]) -> dict[int, Motor]:
+    def _spread_motors(self, motors: AnyMotors, joints: Sequence[str], changes: Mapping[str, Any]) -> dict[int, Motor]:
         """Return motors by joint; raises `TaskError` where their number, names or values are wrong."""
         if isinstance(motors, Mapping):
             if joints:

@@ -17,10 +17,10 @@ from rlctl.task.batch import BatchTask, WorldRngs, read_rows
 from rlctl.task.returned import not_a_number, not_by_name, reward_not_finite, term_mismatch
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task
+from rlctl.task.world_index import WorldIndex
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Worlds = NDArray[np.int64]
 
 
 ONE_FLAG = {False: np.zeros(1, bool), True: np.ones(1, bool)}
@@ -42,13 +42,13 @@ class TaskCalls(Protocol):
     def sim_of(self, sim: Any, world: int) -> Sim:
         """Return the simulation of one world, on which events act."""
 
-    def restore(self, sim: Any, worlds: Worlds) -> None:
+    def restore(self, sim: Any, worlds: WorldIndex) -> None:
         """Take some worlds back to the state in which they were saved."""
 
-    def reset(self, generators: Sequence[np.random.Generator], worlds: Worlds) -> None:
+    def reset(self, generators: Sequence[np.random.Generator], worlds: WorldIndex) -> None:
         """Begin the episodes of some worlds."""
 
-    def set_level(self, levels: Array, worlds: Worlds) -> None:
+    def set_level(self, levels: Array, worlds: WorldIndex) -> None:
         """Set how hard the next episodes of some worlds are."""
 
     def act(self, action: Any) -> None:
@@ -82,7 +82,7 @@ class TaskCalls(Protocol):
     def markers(self) -> dict[str, Any]:
         """Return points to draw by name, each of shape (n, 3)."""
 
-    def leave_others(self, sim: Any, worlds: Worlds) -> contextlib.AbstractContextManager[None]:
+    def leave_others(self, sim: Any, worlds: WorldIndex) -> contextlib.AbstractContextManager[None]:
         """Take back what the task's methods, which see all worlds, change in the others than `worlds`."""
 
     def check_kept(self, when: str) -> None:
@@ -109,15 +109,15 @@ class OneWorldCalls:
         one: Sim = sim
         return one
 
-    def restore(self, sim: Any, worlds: Worlds) -> None:
+    def restore(self, sim: Any, worlds: WorldIndex) -> None:
         """Take the world back to the state in which it was saved."""
         sim.restore()
 
-    def reset(self, generators: Sequence[np.random.Generator], worlds: Worlds) -> None:
+    def reset(self, generators: Sequence[np.random.Generator], worlds: WorldIndex) -> None:
         """Begin the episode."""
         self.task.reset(generators[0])
 
-    def set_level(self, levels: Array, worlds: Worlds) -> None:
+    def set_level(self, levels: Array, worlds: WorldIndex) -> None:
         """Set how hard the next episode is."""
         self.task.level = float(levels[0])
 
@@ -203,7 +203,7 @@ class OneWorldCalls:
         """Return points to draw, each of shape (1, 3)."""
         return {name: np.asarray(value)[None] for name, value in self.task.markers().items()}
 
-    def leave_others(self, sim: Any, worlds: Worlds) -> contextlib.AbstractContextManager[None]:
+    def leave_others(self, sim: Any, worlds: WorldIndex) -> contextlib.AbstractContextManager[None]:
         """Do nothing: there are no other worlds."""
         return contextlib.nullcontext()
 
@@ -236,16 +236,16 @@ class ManyWorldCalls:
         one: Sim = sim.one(world)
         return one
 
-    def restore(self, sim: Any, worlds: Worlds) -> None:
+    def restore(self, sim: Any, worlds: WorldIndex) -> None:
         """Take some worlds back to the state in which they were saved."""
         sim.restore(worlds)
 
-    def reset(self, generators: Sequence[np.random.Generator], worlds: Worlds) -> None:
+    def reset(self, generators: Sequence[np.random.Generator], worlds: WorldIndex) -> None:
         """Begin the episodes of some worlds."""
         self.task.clear_kept(worlds)
         self.task.reset(WorldRngs(generators), worlds)
 
-    def set_level(self, levels: Array, worlds: Worlds) -> None:
+    def set_level(self, levels: Array, worlds: WorldIndex) -> None:
         """Set how hard the next episodes of some worlds are."""
         self.task.level[worlds] = levels
 
@@ -318,7 +318,7 @@ class ManyWorldCalls:
         return {name: self._read_part("markers", name, value) for name, value in markers.items()}
 
     @contextlib.contextmanager
-    def leave_others(self, sim: Any, worlds: Worlds) -> Iterator[None]:
+    def leave_others(self, sim: Any, worlds: WorldIndex) -> Iterator[None]:
         """Take back what the task's methods, which see all worlds, change in the others than `worlds`."""
         if len(worlds) == self._worlds:
             yield

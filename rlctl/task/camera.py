@@ -15,9 +15,9 @@ from rlctl.task.rotations import normalize, rotate
 Point = tuple[float, float, float]
 Pictures = NDArray[np.uint8]
 
-Shape = Literal["box", "ball", "cylinder"]
+ShapeName = Literal["box", "ball", "cylinder"]
 
-SHAPES: tuple[Shape, ...] = ("box", "ball", "cylinder")
+SHAPES: tuple[ShapeName, ...] = ("box", "ball", "cylinder")
 LARGEST_SIDE = 1024  # [pixels]
 _PARALLEL = 1e-6
 
@@ -52,7 +52,7 @@ class Camera:
 class Distractor:
     """A thing that cameras see and nothing touches: a box, a ball or a cylinder, upright."""
 
-    shape: Shape
+    shape: ShapeName
     position: Sequence[float]  # [m], of its middle
     size: Sequence[float]  # [m], half of its sides; all of a ball are its radius, the first of a cylinder too
     yaw: float  # [rad]

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-Start = Literal["first", "zeros"]
+HistoryStart = Literal["first", "zeros"]
 """What fills a history when an episode begins: the first observation, or zeros before it."""
 
 
 class TermHistory:
     """The histories of n worlds; `frames` has the number of values by name."""
 
-    def __init__(self, worlds: int, frames: Mapping[str, int], start: Start) -> None:
+    def __init__(self, worlds: int, frames: Mapping[str, int], start: HistoryStart) -> None:
         self._frames, self._start = frames, start
         self._kept: dict[str, Array] = {}  # by name, shape (worlds, frames, size); made with the first values
         self._worlds = worlds

@@ -10,10 +10,10 @@ from gymnasium import spaces
 
 from rlctl.errors import TaskError, check_name, short_repr
 
-Command = Literal["", "position", "step", "correction", "speed", "torque"]
+CommandKind = Literal["", "position", "step", "correction", "speed", "torque"]
 WIDEST_RANGE = 1e3  # wider limits are none: some models write 1e16
 
-_KINDS: dict[Command, str] = {
+_KINDS: dict[CommandKind, str] = {
     "position": "scale",
     "step": "step",
     "correction": "correction",
@@ -83,7 +83,7 @@ class Joints:
             raise TaskError("joints: clips_target needs low and high")
 
     @property
-    def command(self) -> tuple[Command, Sequence[float]]:
+    def command(self) -> tuple[CommandKind, Sequence[float]]:
         """What an action commands, and how much per 1 of the action and joint; ("", ()) if that is not known."""
         for command, kind in _KINDS.items():
             if per_action := getattr(self, f"action_{kind}"):

@@ -180,7 +180,7 @@ _POSITIVE = (
     "duty_per_rad_and_gain",
 )
 
-Motors = Motor | str | Sequence[Motor | str] | Mapping[str, Motor | str | Mapping[str, Any]]
+AnyMotors = Motor | str | Sequence[Motor | str] | Mapping[str, Motor | str | Mapping[str, Any]]
 """A motor, or the name of one in the table, for all joints or one per joint, or by joint.
 
 By joint it may also be a mapping of values by field, as `rlctl identify` writes them.

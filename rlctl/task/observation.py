@@ -102,7 +102,7 @@ class View:
         self._history = TermHistory(worlds, self.frames, task.history_start) if self.frames else None
         self._single_shapes = {name: np.shape(value) for name, value in first.items()}
         self._shapes = {name: self._find_shape(name, value) for name, value in first.items()}
-        self.layout = Layout({name: math.prod(shape) for name, shape in self._shapes.items()})
+        self.layout = Layout({name: math.prod(shape) for name, shape in self._shapes.items()}, self.frames)
         if empty := [name for name, size in self.layout.sizes.items() if size == 0]:
             raise TaskError(f"{self._name}: observation {empty[0]!r} is empty: check the slice in observe")
         self._bounds = {name: bounds for name, bounds in task.observation_bounds.items() if name in first}

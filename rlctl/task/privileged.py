@@ -10,7 +10,7 @@ from rlctl.errors import RecipeError, TaskError, short_repr
 from rlctl.task.layout import Layout
 from rlctl.task.returned import not_by_name
 
-Row = NDArray[np.float32]
+PrivilegedRow = NDArray[np.float32]
 Drawn = Mapping[str, Mapping[str, float]]
 """Per event the values that it drew, by name."""
 
@@ -50,7 +50,7 @@ class CriticSight:
         """Return what the task names now."""
         return task.privileged() if self._of_task else {}
 
-    def write_task(self, rows: Row, parts: Mapping[str, Any]) -> None:
+    def write_task(self, rows: PrivilegedRow, parts: Mapping[str, Any]) -> None:
         """Write what the task names into `rows`, shape (..., size); raises `TaskError` if it does not fit."""
         if not isinstance(parts, dict) or list(parts) != list(self._of_task):
             names = list(parts) if isinstance(parts, dict) else parts
@@ -63,12 +63,12 @@ class CriticSight:
                 )
             rows[..., self._columns[name]] = values
 
-    def find_fault(self, row: Row) -> str:
+    def find_fault(self, row: PrivilegedRow) -> str:
         """Return the name of an element that is not finite; empty if there is none."""
         bad = ~np.isfinite(row)
         return next((name for name, columns in self._columns.items() if bad[columns].any()), "")
 
-    def write_events(self, row: Row, drawn: Drawn) -> None:
+    def write_events(self, row: PrivilegedRow, drawn: Drawn) -> None:
         """Write the values of the events in `drawn` into a row, shape (size,)."""
         for event, names in self._of_events.items():
             if event in drawn:

@@ -15,9 +15,11 @@ from rlctl.errors import TaskError
 from rlctl.task.batch import WorldRngs
 from rlctl.task.motion import MotionClip, align_signs
 from rlctl.task.rotations import from_axis, invert, multiply, rotate, rotate_inverse
+from rlctl.task.world_index import WorldIndex
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
+ClipRows = NDArray[np.int64]
+"""Numbers of rows of the clips."""
 _UP = (0.0, 0.0, 1.0)
 _DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -56,11 +58,11 @@ class Reference:
             if len(clip) < 3:
                 raise TaskError(f"motion {clip.name}: {clip.duration:.3g} s, less than two control steps")
         lengths = [len(clip) for clip in clips]
-        self.ends: Rows = np.cumsum(lengths) - 1
+        self.ends: ClipRows = np.cumsum(lengths) - 1
         """The last row of each clip."""
-        self.starts: Rows = self.ends - lengths + 1
-        self.clip_of: Rows = np.repeat(np.arange(len(clips)), lengths)
-        self.following: Rows = np.minimum(np.arange(sum(lengths)) + 1, self.ends[self.clip_of])
+        self.starts: ClipRows = self.ends - lengths + 1
+        self.clip_of: NDArray[np.int64] = np.repeat(np.arange(len(clips)), lengths)
+        self.following: ClipRows = np.minimum(np.arange(sum(lengths)) + 1, self.ends[self.clip_of])
         """The row after each row; the last row of a clip follows itself."""
         self.joint_positions = np.concatenate([clip.take_joints(joint_order) for clip in clips])
         self.joint_velocities = self._differentiate(self.joint_positions)
@@ -131,7 +133,7 @@ class Reference:
         places = np.stack([body.link_position(link) for link in self.link_names], axis=1)
         return rotate_inverse(heading[:, None], places - root[:, None])
 
-    def place(self, body: Any, rows: Rows, worlds: Rows, joint_noise: Any = 0.0) -> None:
+    def place(self, body: Any, rows: ClipRows, worlds: WorldIndex, joint_noise: Any = 0.0) -> None:
         """Put the body of some worlds where the rows have it, with its velocities; joints in the clips' order."""
         turn = self.orientation[rows]
         body.set_base(
@@ -143,7 +145,7 @@ class Reference:
         )
         body.set_joints(self.joint_positions[rows] + joint_noise, self.joint_velocities[rows], worlds=worlds)
 
-    def draw(self, rng: WorldRngs, levels: Array) -> Rows:
+    def draw(self, rng: WorldRngs, levels: Array) -> ClipRows:
         """Draw the rows in which episodes start, shape (k,): any row, but not the last `least` seconds of a clip.
 
         A level below 1 is where an episode of the world failed, as `find_levels` returns it: half of the starts are
@@ -155,14 +157,14 @@ class Reference:
         first = np.maximum(failed - round(self.near / self.control_dt), self.starts[self.clip_of[failed]])
         again = first + (close * (failed - first + 1)).astype(int)
         again = self.startable[np.searchsorted(self.startable, again, side="right") - 1]
-        chosen: Rows = np.where((levels < 1.0) & (where < 0.5), again, rows)
+        chosen: ClipRows = np.where((levels < 1.0) & (where < 0.5), again, rows)
         return chosen
 
-    def find_levels(self, rows: Rows, failed: NDArray[np.bool_]) -> Array:
+    def find_levels(self, rows: ClipRows, failed: NDArray[np.bool_]) -> Array:
         """Return the levels of the episodes after those that end in `rows`; 1 for one that did not fail."""
         return np.where(failed, (rows + 0.5) / len(self), 1.0)
 
-    def compare(self, body: Any, rows: Rows) -> Deviation:
+    def compare(self, body: Any, rows: ClipRows) -> Deviation:
         """Return how far the bodies are from rows of shape (worlds,). Heading and place are not part of the others."""
         orientation = body.base_orientation
         heading, wanted = find_heading(orientation), self.heading[rows]

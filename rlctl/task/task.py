@@ -13,7 +13,7 @@ from rlctl.errors import TaskError
 from rlctl.task.camera import Camera, check_cameras
 from rlctl.task.commands import CommandTerm
 from rlctl.task.events import Event
-from rlctl.task.history import Start
+from rlctl.task.history import HistoryStart
 from rlctl.task.joints import Joints
 from rlctl.task.mirror import Declaration
 from rlctl.task.sim import Sim
@@ -46,7 +46,7 @@ class TaskDefinition:
     """Observations that are computed from measured quantities, by name; see `rlctl.task.terms`."""
     observation_history: ClassVar[Mapping[str, int]] = {}
     """Number of last values that an observation consists of, oldest first, by name; other observations have one."""
-    history_start: ClassVar[Start] = "first"
+    history_start: ClassVar[HistoryStart] = "first"
     """What fills histories when an episode begins: `first`, the first observation, or `zeros`."""
     observation_units: ClassVar[Mapping[str, str]] = {}
     """Unit by name, also of the quantities of `observation_terms`."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rlctl.errors import TaskError
 from rlctl.task.mesh_paths import has_scheme, resolve_mesh
 
-Element = ElementTree.Element
+XmlElement = ElementTree.Element
 Moments = NDArray[np.float64]
 """Principal moments of inertia in ascending order [kg m^2], shape (3,)."""
 
@@ -42,7 +42,7 @@ class Urdf:
     """A URDF as an engine is to load it; `root` has absolute paths of meshes."""
 
     path: Path
-    root: Element | None
+    root: XmlElement | None
     """None for a file that is not XML: PyBullet reads more than XML allows."""
     problem: str = ""
     """Why it is not XML."""
@@ -122,13 +122,13 @@ def find_encoding(data: bytes) -> str:
     return "utf-8"
 
 
-def _parse(data: bytes) -> Element:
+def _parse(data: bytes) -> XmlElement:
     if find_encoding(data) == _LATIN:
         return ElementTree.fromstring(data.decode(_LATIN))
     return ElementTree.fromstring(data)
 
 
-def _check_names(path: Path, root: Element) -> None:
+def _check_names(path: Path, root: XmlElement) -> None:
     for joint in root.findall("joint"):
         child = joint.find("child")
         if not joint.get("name"):
@@ -147,14 +147,14 @@ def _check_names(path: Path, root: Element) -> None:
         raise TaskError(f"{path}: {len(bases)} links are no joint's child ({shown}); a URDF has one base")
 
 
-def _check_masses(path: Path, root: Element) -> None:
+def _check_masses(path: Path, root: XmlElement) -> None:
     for link in root.findall("link"):
         mass = read_mass(link)
         if mass is not None and not math.isfinite(mass):
             raise TaskError(f"{path}: link {link.get('name')!r} has a mass of {mass:g} kg; write its mass")
 
 
-def _find_meshes(urdf: Urdf, root: Element) -> None:
+def _find_meshes(urdf: Urdf, root: XmlElement) -> None:
     for link in root.findall("link"):
         for shape in [*link.findall("collision"), *link.findall("visual")]:
             for mesh in shape.iterfind(".//mesh[@filename]"):
@@ -165,7 +165,7 @@ def _find_meshes(urdf: Urdf, root: Element) -> None:
         texture.set("filename", str(resolve_mesh(texture.get("filename", ""), urdf.path) or texture.get("filename")))
 
 
-def _find_mesh(urdf: Urdf, link: Element, shape: Element, mesh: Element) -> None:
+def _find_mesh(urdf: Urdf, link: XmlElement, shape: XmlElement, mesh: XmlElement) -> None:
     name, link_name = mesh.get("filename", ""), link.get("name", "")
     found = resolve_mesh(name, urdf.path)
     urdf.changed = urdf.changed or has_scheme(name)
@@ -178,14 +178,14 @@ def _find_mesh(urdf: Urdf, link: Element, shape: Element, mesh: Element) -> None
         urdf.missing.append(f"link {link_name!r}: mesh {name!r}")
 
 
-def _draw_collision_shapes(link: Element) -> None:
+def _draw_collision_shapes(link: XmlElement) -> None:
     for shape in link.findall("collision"):
         drawn = copy.deepcopy(shape)
         drawn.tag = "visual"
         link.append(drawn)
 
 
-def _remove_repeated_materials(urdf: Urdf, root: Element) -> None:
+def _remove_repeated_materials(urdf: Urdf, root: XmlElement) -> None:
     """Leave the first material of each shape, the one that PyBullet draws; MuJoCo refuses several.
 
     Converters of meshes write a material for each part of the mesh. Nothing but the colour depends on it.
@@ -200,7 +200,7 @@ def _remove_repeated_materials(urdf: Urdf, root: Element) -> None:
                 urdf.recolored[name] = max(urdf.recolored.get(name, 0), len(materials))
 
 
-def _add_masses(urdf: Urdf, root: Element, fixed: bool) -> None:
+def _add_masses(urdf: Urdf, root: XmlElement, fixed: bool) -> None:
     """Give mass to links without `<inertial>`: hardly any to frames, 1 kg where a joint would move nothing else."""
     links = {str(link.get("name")): link for link in root.findall("link")}
     joints = [joint for joint in _list_joints(root) if {joint.parent, joint.child} <= set(links)]
@@ -229,14 +229,14 @@ class _Joint:
     is_fixed: bool
 
 
-def _list_joints(root: Element) -> Iterator[_Joint]:
+def _list_joints(root: XmlElement) -> Iterator[_Joint]:
     for joint in root.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
         if parent is not None and child is not None:
             yield _Joint(parent.get("link", ""), child.get("link", ""), joint.get("type") == "fixed")
 
 
-def find_wheels(root: Element) -> dict[str, float]:
+def find_wheels(root: XmlElement) -> dict[str, float]:
     """Return the widths of wheels by link [m]: collision cylinders on a joint without limits, about the same axis."""
     links = {str(link.get("name")): link for link in root.findall("link")}
     wheels: dict[str, float] = {}
@@ -253,7 +253,7 @@ def find_wheels(root: Element) -> dict[str, float]:
     return wheels
 
 
-def _is_about(axis: NDArray[np.float64], place: Element | None) -> bool:
+def _is_about(axis: NDArray[np.float64], place: XmlElement | None) -> bool:
     """Return whether the z axis of a shape is that of a joint, both in the frame of the link."""
     length = float(np.linalg.norm(axis))
     if not length > 0:
@@ -271,7 +271,7 @@ def _is_about(axis: NDArray[np.float64], place: Element | None) -> bool:
     return bool(off_axis < _SAME_AXIS and tilt < _SAME_AXIS)
 
 
-def _read_vector(element: Element | None, name: str, default: tuple[float, float, float]) -> NDArray[np.float64]:
+def _read_vector(element: XmlElement | None, name: str, default: tuple[float, float, float]) -> NDArray[np.float64]:
     """Return an attribute of three numbers, or `default`; engines complain of one that is something else."""
     text = "" if element is None else element.get(name, "")
     try:
@@ -302,13 +302,13 @@ def _list_carried(top: str, joints: list[_Joint], *, through_joints: bool) -> se
     return carried
 
 
-def read_mass(link: Element) -> float | None:
+def read_mass(link: XmlElement) -> float | None:
     """Return the mass of a link [kg]; None if the file has none, 0 if it is not a number."""
     mass = link.find("inertial/mass")
     return None if mass is None else read_number(mass, "value")
 
 
-def read_number(element: Element, name: str) -> float:
+def read_number(element: XmlElement, name: str) -> float:
     """Return an attribute, or 0 if it is not a number; engines say so themselves, or `model_faults` does."""
     try:
         return float(element.get(name, 0.0))
@@ -316,7 +316,7 @@ def read_number(element: Element, name: str) -> float:
         return 0.0
 
 
-def read_products(link: Element) -> NDArray[np.float64] | None:
+def read_products(link: XmlElement) -> NDArray[np.float64] | None:
     """Return the inertia matrix of a link in the file [kg m^2], shape (3, 3); None if it has none, or no numbers."""
     inertia = link.find("inertial/inertia")
     try:
@@ -329,13 +329,13 @@ def read_products(link: Element) -> NDArray[np.float64] | None:
     return matrix if np.isfinite(matrix).all() else None
 
 
-def _write_products(inertia: Element, matrix: NDArray[np.float64]) -> None:
+def _write_products(inertia: XmlElement, matrix: NDArray[np.float64]) -> None:
     places = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     for name, place in zip(_PRODUCTS, places, strict=True):
         inertia.set(name, repr(float(matrix[place])))
 
 
-def _raise_moments(urdf: Urdf, root: Element) -> None:
+def _raise_moments(urdf: Urdf, root: XmlElement) -> None:
     for link in root.findall("link"):
         mass, matrix = read_mass(link), read_products(link)
         if not mass or mass < 0 or matrix is None:

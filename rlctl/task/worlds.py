@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rlctl.engine import MUJOCO, PYBULLET, Engine
 from rlctl.errors import RecipeError, TaskError, UsageError, WorldFailed, check_name, in_world
 from rlctl.task.batch import BatchTask
-from rlctl.task.calls import Array, Flags, ManyWorldCalls, OneWorldCalls, TaskCalls, Worlds
+from rlctl.task.calls import Array, Flags, ManyWorldCalls, OneWorldCalls, TaskCalls
 from rlctl.task.camera import locate
 from rlctl.task.events import Event, EventSettings
 from rlctl.task.events.acting import ActingEvents, Streams, seed_streams
@@ -37,6 +37,7 @@ from rlctl.task.pybullet.sim import PybulletSim
 from rlctl.task.returned import WrongRow, reward_not_finite
 from rlctl.task.sim import Sim
 from rlctl.task.task import Task, check_definition, check_parameters
+from rlctl.task.world_index import WorldIndex
 
 RenderMode = Literal["human", "rgb_array"] | None
 
@@ -114,7 +115,7 @@ class TaskWorlds:
             self._zero_actions = np.zeros(count * box.low.size, box.dtype)
         self.level = 1.0
         """How hard the next episodes are, where `reset` is not told."""
-        self._all: Worlds = np.arange(count)
+        self._all: WorldIndex = np.arange(count)
         self.step_of = np.zeros(count, np.int64)
         """Steps since the start of each world's episode."""
         self._gained = np.zeros((count, 1 + len(self.weights)))  # reward and raw terms of the episodes so far
@@ -227,7 +228,7 @@ class TaskWorlds:
 
     def reset(
         self,
-        worlds: Worlds,
+        worlds: WorldIndex,
         seeds: Sequence[int],
         levels: Array | None = None,
         generators: Sequence[np.random.Generator] | None = None,
@@ -276,7 +277,7 @@ class TaskWorlds:
             self._note(world, self._signals.drawn[world])
         return observation
 
-    def shorten(self, worlds: Worlds, limits: Worlds) -> None:
+    def shorten(self, worlds: WorldIndex, limits: NDArray[np.int64]) -> None:
         """Truncate the next episodes of some worlds after so many steps, or after `max_steps` where it is 0."""
         self._limits[worlds] = np.where(limits > 0, limits, self.max_steps)
 
@@ -292,7 +293,7 @@ class TaskWorlds:
             with in_world(world):
                 self.critic.write_events(self._critic_rows[world], drawn)
 
-    def observe_privileged(self, worlds: Worlds) -> NDArray[np.float32]:
+    def observe_privileged(self, worlds: WorldIndex) -> NDArray[np.float32]:
         """Return what only the critic sees now in some worlds, shape (k, size); call `show_critic` once before."""
         assert self.critic is not None
         with self.calls.leave_others(self.sim, worlds):
@@ -304,7 +305,7 @@ class TaskWorlds:
             self._fail(worlds[row], f"privileged {self.critic.find_fault(chosen[row])!r} is not finite at step {{}}")
         return chosen
 
-    def step(self, action: Any, worlds: Worlds | None = None) -> WorldsStep:
+    def step(self, action: Any, worlds: WorldIndex | None = None) -> WorldsStep:
         """Advance all worlds, or some, by a control step; `action` has a row for each of them, shape (k, ...)."""
         self._steps_left -= 1  # here, so that it is right after a step that fails
         if worlds is None or self._is_all(worlds):
@@ -315,27 +316,30 @@ class TaskWorlds:
         with self.calls.leave_others(self.sim, worlds):
             return self._step(chosen, worlds)
 
-    def _is_all(self, worlds: Worlds) -> bool:
+    def _is_all(self, worlds: WorldIndex) -> bool:
         return self.count == 1 or (len(worlds) == self.count and bool((worlds == self._all).all()))
 
-    def _step(self, chosen: Any, worlds: Worlds) -> WorldsStep:
+    def _step(self, chosen: Any, worlds: WorldIndex) -> WorldsStep:
+        """Take a step; `chosen` and what is returned have rows of `worlds`, names in `_of_all` those of all worlds."""
         is_all, calls = worlds is self._all, self.calls
         acted = self._signals.act(chosen, worlds)
         if is_all:
+            chosen_of_all = chosen
             calls.act(acted)
             self.sim.step()
         else:
+            chosen_of_all = self._spread(chosen, worlds)
             calls.act(self._spread(acted, worlds))
             self.sim.step(worlds)
-            chosen = self._spread(chosen, worlds)
         if self.after_physics is not None:
             self.after_physics()
-        terminated = calls.is_terminated()
-        gained = self.rewards(chosen)
+        terminated_of_all = calls.is_terminated()
+        gained_of_all = self.rewards(chosen_of_all)
         if is_all:
+            terminated, gained = terminated_of_all, gained_of_all
             np.add(self._gained, gained, out=self._gained)
         else:
-            terminated, gained = terminated[worlds], gained[worlds]
+            terminated, gained = terminated_of_all[worlds], gained_of_all[worlds]
             self._gained[worlds] += gained
         reward, terms = gained[:, 0], gained[:, 1:]
         truncated = self._find_truncated(terminated, worlds)
@@ -345,11 +349,11 @@ class TaskWorlds:
             self._run_due(worlds)
         success = None
         if self.has_success:
-            success = calls.is_success()
+            success_of_all = calls.is_success()
             if is_all:
-                self._last_success = success
+                success = self._last_success = success_of_all
             else:
-                success = success[worlds]
+                success = success_of_all[worlds]
                 self._last_success[worlds] = success
         observation = self._observe(worlds)
         calls.check_kept("a step")
@@ -366,13 +370,13 @@ class TaskWorlds:
         except WrongRow as wrong:
             self._fail(wrong.row, str(wrong))
 
-    def _find_truncated(self, terminated: Flags, worlds: Worlds) -> Flags:
+    def _find_truncated(self, terminated: Flags, worlds: WorldIndex) -> Flags:
         late = self._find_late(terminated, worlds)
         if not self.calls.has_end:
             return late
         return late | (self.calls.is_truncated()[worlds] & ~terminated)
 
-    def _find_late(self, terminated: Flags, worlds: Worlds) -> Flags:
+    def _find_late(self, terminated: Flags, worlds: WorldIndex) -> Flags:
         if self._steps_left > 0:  # no world can be at the time limit
             return self._no_flags if len(worlds) == self.count else self._no_flags[: len(worlds)]
         self._count_steps_left()
@@ -381,13 +385,13 @@ class TaskWorlds:
     def _count_steps_left(self) -> None:
         self._steps_left = int((self._limits - self.step_of).min())
 
-    def _spread(self, values: Any, worlds: Worlds) -> Any:
+    def _spread(self, values: Any, worlds: WorldIndex) -> Any:
         """Return values of some worlds as rows of all worlds; the others have zeros."""
         full = np.zeros((self.count, *values.shape[1:]), values.dtype)
         full[worlds] = values
         return full
 
-    def _check_action(self, action: Any, worlds: Worlds) -> Any:
+    def _check_action(self, action: Any, worlds: WorldIndex) -> Any:
         if not self._is_box:
             for row, one in zip(worlds, action, strict=True):
                 if not self.action_space.contains(one):
@@ -410,7 +414,7 @@ class TaskWorlds:
         assert place
         raise WorldFailed(f"{self.name}: {before}{self.step_of[world]}{after}", int(world))
 
-    def _check_reward(self, reward: Array, terms: Array, worlds: Worlds) -> None:
+    def _check_reward(self, reward: Array, terms: Array, worlds: WorldIndex) -> None:
         bad = ~np.isfinite(reward)
         if bad.any():
             row = int(bad.argmax())
@@ -441,7 +445,7 @@ class TaskWorlds:
         """Return how far two bodies of a world overlap at most now [m]."""
         return self.sim_of(world).deepest_contact
 
-    def teacher_sees(self, worlds: Worlds) -> Any:
+    def teacher_sees(self, worlds: WorldIndex) -> Any:
         """Return what the teacher sees now of some worlds, shape (k, ...)."""
         assert self.teacher is not None
         seen = self.teacher.seen
@@ -468,7 +472,7 @@ class TaskWorlds:
         space: spaces.Space[Any] = self.view.space
         return space
 
-    def _run_due(self, worlds: Worlds) -> None:
+    def _run_due(self, worlds: WorldIndex) -> None:
         self.drawn_now = {}
         due = np.any([self.step_of[worlds] % period == 0 for period in set(self._acting.periods)], axis=0)
         for world in worlds[due].tolist():
@@ -493,7 +497,7 @@ class TaskWorlds:
         """Return what the task observes now without noise and delay, its terms computed; each of shape (n, ...)."""
         return self._compute_terms(self.calls.observe())
 
-    def _observe(self, worlds: Worlds) -> Observation:
+    def _observe(self, worlds: WorldIndex) -> Observation:
         exact = self._compute_terms(self.calls.observe())
         if worlds is not self._all:
             exact = {name: value[worlds] for name, value in exact.items()}
@@ -516,7 +520,7 @@ class TaskWorlds:
             return self.view.cameras
         return list(dict.fromkeys([*self.view.cameras, *self.teacher.view.cameras]))
 
-    def _read_privileged(self, view: View, worlds: Worlds) -> dict[str, Any]:
+    def _read_privileged(self, view: View, worlds: WorldIndex) -> dict[str, Any]:
         if not view.privileged:
             return {}
         parts = self.calls.privileged()

@@ -9,7 +9,7 @@ from rlctl.policy.file import PolicyInfo
 from rlctl.recipe.stages import Stage
 from rlctl.tasks.description import Description
 
-Row = tuple[str, ...]
+Cells = tuple[str, ...]
 Json = Mapping[str, Any]
 
 _LONGEST_SPACE = 100  # [characters]; the JSON has the full text
@@ -50,7 +50,7 @@ def show(description: Description, json: str | None) -> None:
     _print_section(f"shipped policy  {content['policy_file'] or 'none'}", _list_scores(description.policy))
 
 
-def _list_scores(info: PolicyInfo | None) -> list[Row]:
+def _list_scores(info: PolicyInfo | None) -> list[Cells]:
     if info is None:
         return []
     steps = f"{info.algo}, {info.training_steps:,} steps"
@@ -60,7 +60,7 @@ def _list_scores(info: PolicyInfo | None) -> list[Row]:
     return [(name, *describe_score(score).split(", ")) for name, score in scores.items()]
 
 
-def _print_section(title: str, rows: Iterable[Row], none: str = "") -> None:
+def _print_section(title: str, rows: Iterable[Cells], none: str = "") -> None:
     from rich.text import Text
 
     name, _, rest = title.partition("  ")
@@ -70,12 +70,12 @@ def _print_section(title: str, rows: Iterable[Row], none: str = "") -> None:
     _print_rows(listed, indent="  ")
 
 
-def _print_rows(rows: list[Row], indent: str = "") -> None:
+def _print_rows(rows: list[Cells], indent: str = "") -> None:
     if rows:
         output.print_table([""] * len(rows[0]), [(indent + row[0], *row[1:]) for row in rows], left=("",))
 
 
-def _list_facts(content: Json) -> list[Row]:
+def _list_facts(content: Json) -> list[Cells]:
     definition, steps, control_dt = content["definition"], content["max_steps"], content["control_dt"]
     facts = {
         "class": content["target"],
@@ -93,7 +93,7 @@ def _list_facts(content: Json) -> list[Row]:
     return [(name, fact) for name, fact in facts.items() if fact]
 
 
-def _format_camera(name: str, camera: Json) -> Row:
+def _format_camera(name: str, camera: Json) -> Cells:
     width, height = camera["size"]
     place = "stands still" if camera["body"] is None else f"on {camera['body']}"
     if camera["link"] is not None:
@@ -106,7 +106,7 @@ def _shorten(space: str) -> str:
     return space if len(space) <= _LONGEST_SPACE else f"{space.partition('(')[0]}(...)"
 
 
-def _list_quantities(quantities: list[Json]) -> list[Row]:
+def _list_quantities(quantities: list[Json]) -> list[Cells]:
     rows = []
     for quantity in quantities:
         size = "x".join(map(str, quantity["shape"])) if quantity["kind"] == "Box" else str(quantity["kind"])
@@ -120,7 +120,7 @@ def _format_bounds(low: float | None, high: float | None) -> str:
     return f"{'-inf' if low is None else _format_value(low)} to {'inf' if high is None else _format_value(high)}"
 
 
-def _list_joints(joints: Json | None) -> list[Row]:
+def _list_joints(joints: Json | None) -> list[Cells]:
     if joints is None:
         return []
     columns = [
@@ -131,7 +131,7 @@ def _list_joints(joints: Json | None) -> list[Row]:
     return list(zip(joints["names"], *(column for column in columns if column), strict=True))
 
 
-def _list_parameters(parameters: list[Json], trained: Mapping[str, Any]) -> list[Row]:
+def _list_parameters(parameters: list[Json], trained: Mapping[str, Any]) -> list[Cells]:
     return [
         (
             (name := parameter["name"]),
@@ -143,7 +143,7 @@ def _list_parameters(parameters: list[Json], trained: Mapping[str, Any]) -> list
     ]
 
 
-def _list_rewards(terms: list[Json]) -> list[Row]:
+def _list_rewards(terms: list[Json]) -> list[Cells]:
     return [
         (
             term["name"],
@@ -154,7 +154,7 @@ def _list_rewards(terms: list[Json]) -> list[Row]:
     ]
 
 
-def _format_event(event: Json) -> Row:
+def _format_event(event: Json) -> Cells:
     parameters, when = dict(event["parameters"]), event["when"]
     if "every_s" in parameters:
         when = f"every {_format_value(parameters.pop('every_s'))} s"
@@ -165,7 +165,7 @@ def _format_event(event: Json) -> Row:
     return event["name"], when, event["function"], arguments, acts
 
 
-def _format_stage(number: int, stage: Stage) -> Row:
+def _format_stage(number: int, stage: Stage) -> Cells:
     rule = stage.promote.model_dump(by_alias=True, exclude_none=True, exclude_defaults=True) if stage.promote else {}
     until = ", ".join(f"{name} {_format_value(value)}" for name, value in rule.items())
     return str(number), str(stage), f"until {until}" if until else "last stage, used for evaluation"

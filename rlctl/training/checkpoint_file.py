@@ -2,8 +2,8 @@
 
 A checkpoint is a folder with `policy.safetensors` (a policy file), `state.safetensors` (optimisers, generators,
 statistics, the actions of running episodes) and `state.json` (plain data, and each file's sha256), written atomically.
-The replay buffer of an off-policy algorithm, too large to be written each time, is in segments next to the folders. Its
-transitions are numbered in the order of the steps; a step of all environments is one. A checkpoint lists the segments,
+The replay buffer of an off-policy algorithm, too large to be written each time, is in parts next to the folders. Its
+transitions are numbered in the order of the steps; a step of all environments is one. A checkpoint lists the parts,
 oldest first; where two overlap the later one is valid.
 """
 
@@ -35,12 +35,12 @@ from rlctl.training.stacked_replay import StackedRows
 from rlctl.version import collect_versions
 
 FORMAT = 1
-SEGMENT_BYTES = 8 * 2**20  # size of a segment [bytes]; the last one is written again until it has this size
+PART_BYTES = 8 * 2**20  # size of a part [bytes]; the last one is written again until it has this size
 _FIELDS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _POLICY, _STATE, _TENSORS = "policy.safetensors", "state.json", "state.safetensors"
 
 
-class Segment(pydantic.BaseModel):
+class ReplayPart(pydantic.BaseModel):
     """The transitions from `first` to `last` - 1, in a file."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
@@ -64,7 +64,7 @@ class State(pydantic.BaseModel):
     model: dict[str, Any]  # plain data of `snapshot.take`
     progress: Progress
     callbacks: list[dict[str, Any]] = []  # plain data of `Callbacks.take`
-    segments: list[Segment] = []  # the segments of the replay buffer
+    segments: list[ReplayPart] = []  # the files of the replay buffer
     computed_with: dict[str, str]  # what bit-exact results depend on: versions, processor, threads
     sha256: dict[str, str] = {}
 
@@ -113,8 +113,8 @@ def read(folder: Path) -> Checkpoint:
     state = _read_state(folder)
     for name in (_POLICY, _TENSORS):
         files.check_digest(folder / name, state.sha256.get(name, ""))
-    for segment in state.segments:
-        files.check_digest(folder.parent / "replay" / segment.name, segment.sha256)
+    for part in state.segments:
+        files.check_digest(folder.parent / "replay" / part.name, part.sha256)
     return Checkpoint(folder, state, load_tensors((folder / _TENSORS).read_bytes()))
 
 
@@ -139,11 +139,11 @@ def _seal(state: Any) -> str:
     return files.digest(json.dumps(state, sort_keys=True).encode())
 
 
-def list_segments(run: RunDirectory) -> list[Segment]:
-    """Return the replay segments that a run's checkpoints name."""
-    named: list[Segment] = []
+def list_replay_parts(run: RunDirectory) -> list[ReplayPart]:
+    """Return the parts of replay buffers that a run's checkpoints name."""
+    named: list[ReplayPart] = []
     for folder in run.checkpoints():
-        with contextlib.suppress(ArtifactError):  # a damaged checkpoint needs no segments any more
+        with contextlib.suppress(ArtifactError):  # a damaged checkpoint needs no parts any more
             named += _read_state(folder).segments
     return named
 
@@ -190,7 +190,7 @@ def environment_tensors(env: WorkerVecEnv) -> Tensors:
 
 
 def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
-    """Replay the running episodes; return a message if an environment does not reach its saved state."""
+    """Repeat the actions of the running episodes; return a message if one does not reach its saved state."""
     steps = tensors["environments/steps"].tolist()
     if len(steps) != env.num_envs:
         raise ArtifactError(f"it was saved with {len(steps)} environments, not {env.num_envs}")
@@ -209,69 +209,69 @@ def restore_environments(env: WorkerVecEnv, tensors: Tensors) -> str | None:
     )
 
 
-class ReplaySegments:
-    """Writes a replay buffer into a folder, segment by segment, and reads it again."""
+class ReplayParts:
+    """Writes a replay buffer into a folder, part by part, and reads it again."""
 
     def __init__(self, folder: Path, buffer: ReplayBuffer) -> None:
         self.folder = folder
         self.buffer = buffer
-        self._segments: list[Segment] = []
+        self._parts: list[ReplayPart] = []
         self._written = 0
-        self._most_rows = max(1, SEGMENT_BYTES // sum(array[:1].nbytes for array in _arrays(buffer).values()))
+        self._most_rows = max(1, PART_BYTES // sum(array[:1].nbytes for array in _arrays(buffer).values()))
 
     def mark_last_changed(self, added: int) -> None:
         """Note that the last of `added` transitions was changed after it was added."""
         self._written = min(self._written, added - 1)
 
-    def save(self, added: int) -> list[Segment]:
-        """Write new transitions, of `added` in total; return the segments of the buffer."""
+    def save(self, added: int) -> list[ReplayPart]:
+        """Write new transitions, of `added` in total; return the parts of the buffer."""
         oldest = max(0, added - self.buffer.buffer_size)
-        segments = [segment for segment in self._segments if segment.last > oldest]
-        if not all((self.folder / segment.name).exists() for segment in segments):  # some were removed
-            segments, self._written = [], 0
+        parts = [part for part in self._parts if part.last > oldest]
+        if not all((self.folder / part.name).exists() for part in parts):  # some were removed
+            parts, self._written = [], 0
         rows = self._most_rows
         first = max(self._written // rows * rows, oldest)
-        segments = [segment for segment in segments if segment.first < first]
-        segments += [self._write(low, min(low + rows, added)) for low in range(first, added, rows)]
-        self._segments, self._written = segments, added
-        return list(segments)
+        parts = [part for part in parts if part.first < first]
+        parts += [self._write(low, min(low + rows, added)) for low in range(first, added, rows)]
+        self._parts, self._written = parts, added
+        return list(parts)
 
-    def _write(self, first: int, last: int) -> Segment:
+    def _write(self, first: int, last: int) -> ReplayPart:
         indices = np.arange(first, last) % self.buffer.buffer_size
         content = save_tensors({name: array[indices] for name, array in _arrays(self.buffer).items()})
-        segment = Segment(first=first, last=last, sha256=files.digest(content))
-        files.write_bytes(self.folder / segment.name, content)
-        return segment
+        part = ReplayPart(first=first, last=last, sha256=files.digest(content))
+        files.write_bytes(self.folder / part.name, content)
+        return part
 
-    def load(self, segments: Sequence[Segment], added: int) -> None:
+    def load(self, parts: Sequence[ReplayPart], added: int) -> None:
         """Fill the buffer with the last of `added` transitions; raises `ArtifactError` if they do not fit it."""
         buffer = self.buffer
         stacks = buffer.observations.stacks if isinstance(buffer.observations, StackedRows) else None
         if stacks is not None:
             stacks.added = added
         reached = max(0, added - buffer.buffer_size)
-        for segment in segments:
-            if segment.first > reached:
+        for part in parts:
+            if part.first > reached:
                 break
-            self._read(segment)
-            reached = max(reached, segment.last)
+            self._read(part)
+            reached = max(reached, part.last)
         if reached != added:
             raise ArtifactError(f"{self.folder}: transitions after number {reached} are missing, of {added}")
         if stacks is not None:
             stacks.finish_loading()
         buffer.pos, buffer.full = added % buffer.buffer_size, added >= buffer.buffer_size
-        self._segments, self._written = list(segments), added
+        self._parts, self._written = list(parts), added
 
-    def remove_others(self, named: Iterable[Segment]) -> None:
-        """Remove the segments that no checkpoint names."""
-        names = {segment.name for segment in named}
+    def remove_others(self, named: Iterable[ReplayPart]) -> None:
+        """Remove the parts that no checkpoint names."""
+        names = {part.name for part in named}
         for file in self.folder.glob("*.safetensors"):
             if file.name not in names:
                 files.remove(file)
 
-    def _read(self, segment: Segment) -> None:
-        file = self.folder / segment.name
-        indices = np.arange(segment.first, segment.last) % self.buffer.buffer_size
+    def _read(self, part: ReplayPart) -> None:
+        file = self.folder / part.name
+        indices = np.arange(part.first, part.last) % self.buffer.buffer_size
         try:
             stored = load_tensors(file.read_bytes())
             for name, array in _arrays(self.buffer).items():

@@ -16,7 +16,7 @@ from rlctl.storage import files
 from rlctl.storage.table import Table
 from rlctl.training import checkpoint_file, snapshot
 from rlctl.training.callbacks import Callbacks
-from rlctl.training.checkpoint_file import Checkpoint, ReplaySegments
+from rlctl.training.checkpoint_file import Checkpoint, ReplayParts
 from rlctl.training.learner import Learner, begin_next_episodes
 from rlctl.training.snapshot import check_finite
 
@@ -36,7 +36,7 @@ class Checkpoints:
         self.problem = ""  # the last write that failed, and why
         self._learner = learner
         buffer = getattr(learner.model, "replay_buffer", None)
-        self._replay = None if buffer is None else ReplaySegments(run.replay_segments, buffer)
+        self._replay = None if buffer is None else ReplayParts(run.replay_parts, buffer)
         self._warn = warn
         self._next_s = time.monotonic()
         self._uncounted_checkpoints = 1  # checkpoints that are written even if not due: the last one
@@ -118,9 +118,9 @@ class Checkpoints:
         of_callbacks, plain_of_callbacks = self.callbacks.take()
         of_rollouts, plain["rollouts"] = learner.rollouts.take()
         tensors |= of_callbacks | of_rollouts | checkpoint_file.environment_tensors(learner.env)
-        segments = []
+        parts = []
         if self._replay is not None:
-            segments = self._replay.save(self._added)
+            parts = self._replay.save(self._added)
             tensors |= checkpoint_file.hindsight_tensors(self._replay.buffer)
         state = checkpoint_file.State(
             run=self.run.id(),
@@ -128,7 +128,7 @@ class Checkpoints:
             model=plain,
             progress=learner.progress,
             callbacks=plain_of_callbacks,
-            segments=segments,
+            segments=parts,
             computed_with=checkpoint_file.describe_computation(learner.model.device),
         )
         checkpoint_file.write(self.run.checkpoint(state.step), state, policy, tensors)
@@ -139,14 +139,18 @@ class Checkpoints:
         return self._learner.steps // self._learner.env.num_envs
 
     def _remove_old(self) -> None:
-        """Remove all checkpoints except the newest `keep`, and replay segments that none of these needs."""
+        """Remove all checkpoints except the newest `keep`, and parts of the replay buffer that none of these needs."""
         for old in self.run.checkpoints()[: -self._learner.recipe.checkpoint.keep]:
             files.remove_tree(old)
         if self._replay is not None:
-            self._replay.remove_others(checkpoint_file.list_segments(self.run))
+            self._replay.remove_others(checkpoint_file.list_replay_parts(self.run))
 
     def restore(self, saved: Checkpoint, changed: Sequence[str]) -> str:
-        """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact."""
+        """Restore a checkpoint; return a message with the reasons, `changed` and others, why it is not exact.
+
+        Callbacks start before: what their `on_start` changes in the model and in the progress is overwritten.
+        """
+        self.callbacks.start(resumed_at=saved.state.step)
         learner, file = self._learner, saved.folder / "policy.safetensors"
         info = PolicyFile.read_info(file)
         info.check_fits(learner.curriculum.goal, file)

@@ -40,8 +40,8 @@ class EvaluationEpisodes:
         self._spec = self._workers.spec
         self._latest: list[RecordedEpisode] = []
 
-    def play(self, policy: PolicyFile, check: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
-        """Play and return the episodes of every evaluation, or `unseen` new ones; `check` may raise to stop."""
+    def play(self, policy: PolicyFile, watch: Callable[[], None], *, unseen: int | None = None) -> list[Episode]:
+        """Play and return the episodes of every evaluation, or `unseen` new ones; `watch` may raise to stop."""
         settings = self._recipe.eval
         workers = self._workers = self._workers or self._make_workers()
         usual = settings.episodes
@@ -51,7 +51,7 @@ class EvaluationEpisodes:
         try:
             workers.set_policy(policy)
             exploration = Exploration(stochastic=not settings.deterministic)
-            return play_episodes(workers, seeds, exploration, record=True, watch=lambda _: check())
+            return play_episodes(workers, seeds, exploration, record=True, watch=lambda _: watch())
         except Exception:
             self.close()
             raise
@@ -98,7 +98,7 @@ class EvaluationEpisodes:
 
 
 class Evaluator:
-    """Evaluates the policy of a learner and keeps the best one; `check` may raise at any time to stop the episodes."""
+    """Evaluates the policy of a learner and keeps the best one; `watch` may raise at any time to stop the episodes."""
 
     def __init__(
         self, learner: Learner, episodes: EvaluationEpisodes, checkpoints: Checkpoints, display: Display
@@ -126,7 +126,7 @@ class Evaluator:
         steps, progress = self._learner.steps, self._learner.progress
         return steps >= progress.next_eval or (self._learner.is_at_end and progress.last_eval < steps)
 
-    def evaluate(self, check: Callable[[], None]) -> dict[str, Any]:
+    def evaluate(self, watch: Callable[[], None]) -> dict[str, Any]:
         """Play, save the best policy, write the row and the episodes; return the row, empty after a failure."""
         row: dict[str, Any] = {}
         steps, progress = self._learner.steps, self._learner.progress
@@ -134,7 +134,7 @@ class Evaluator:
         self._display.phase("evaluating")
         try:
             # Episodes may take minutes, so a signal interrupts them; the resumed run repeats them.
-            episodes = self.episodes.play(policy, check)
+            episodes = self.episodes.play(policy, watch)
         except (TaskError, UsageError, ArtifactError) as error:  # the last two: files were removed in the meantime
             self._note_failure(error)
         else:
@@ -178,7 +178,7 @@ class Evaluator:
         self._display.evaluation(steps, score.success, score.mean_return, better)
         return row
 
-    def compare_best_with_last(self, check: Callable[[], None]) -> None:
+    def compare_best_with_last(self, watch: Callable[[], None]) -> None:
         """Play new episodes with the best and the last policy; keep the last as best if it is better in them.
 
         The highest score of many evaluations is partly luck: a hopper's best policy scored 2,612 in 8 episodes, but
@@ -192,8 +192,8 @@ class Evaluator:
         self._display.phase("best or last")
         last = self._learner.pack()
         try:
-            before = _score(self.episodes.play(self._checkpoints.read_best(), check, unseen=count))
-            after = _score(self.episodes.play(last, check, unseen=count))
+            before = _score(self.episodes.play(self._checkpoints.read_best(), watch, unseen=count))
+            after = _score(self.episodes.play(last, watch, unseen=count))
         except (TaskError, UsageError, ArtifactError) as error:
             self._display.message(f"warning: the best and the last policy were not compared: {error}")
             return

@@ -60,7 +60,14 @@ class TrainingLoop:
             raise
 
     def boundary(self) -> bool:
-        """Do what is due between two updates; return whether the training is done."""
+        """Do what is due between two updates; return whether the training is done.
+
+        A resumed run calls this again at the step of its checkpoint, and then equals one that was never stopped because
+        nothing is done twice. What was done is in `Progress`, which checkpoints store: `last_row` of metrics,
+        `last_segment` of callbacks, `next_eval` and `last_eval` of evaluations, `stage_episodes`, which a new stage
+        empties. Anything that is added here needs such a guard. What came after the checkpoint is repeated; only the
+        file of the best policy may be newer, and is kept then (`Evaluator._is_better`).
+        """
         learner = self.learner
         finished = self._metrics.collect_finished_episodes()
         if learner.steps == 0:

@@ -19,7 +19,7 @@ from rlctl.policy.file import DETERMINISTIC
 from rlctl.recipe.hindsight import find_problem
 from rlctl.recipe.recipe import Hindsight, Recipe
 from rlctl.training.progress import Progress
-from rlctl.training.rollouts import Check, Rollouts, WorkerVecEnv, to_network_layout
+from rlctl.training.rollouts import Rollouts, SegmentWatch, WorkerVecEnv, to_network_layout
 
 
 class OffPolicyRollouts(Rollouts):
@@ -52,9 +52,9 @@ class OffPolicyRollouts(Rollouts):
             sde_every=max(model.sde_sample_freq, 0) if model.use_sde else 0,
         )
 
-    def finish(self, check: Check | None) -> None:
+    def finish(self, watch: SegmentWatch | None) -> None:
         """Store the chunk, not normalised, in the replay buffer, and do what SB3 does after each step."""
-        segment = self.env.finish(check)
+        segment = self.env.finish(watch)
         model, spaces = self.model, split_space(self.model.observation_space)
         observation = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.observation.items()}
         final = {key: to_network_layout(rows, spaces[key]) for key, rows in segment.final.items()}
@@ -84,7 +84,7 @@ class OffPolicyRollouts(Rollouts):
         if steps and model.num_timesteps > model.learning_starts and has_whole_episode(model.replay_buffer):
             updates = model.gradient_steps if model.gradient_steps >= 0 else steps
             if updates > 0:
-                self._update.train(batch_size=model.batch_size, gradient_steps=updates)
+                self._updater.train(batch_size=model.batch_size, gradient_steps=updates)
                 self.rehearse(updates)
 
 

@@ -13,7 +13,7 @@ from rlctl.environments.dict_spaces import join, split, split_space
 from rlctl.play.shared_arrays import SegmentArrays
 from rlctl.policy.actor import Exploration
 from rlctl.policy.layers import Normalize
-from rlctl.training.rollouts import Check, Rollouts, Statistics, to_network_layout
+from rlctl.training.rollouts import Rollouts, SegmentWatch, Statistics, to_network_layout
 from rlctl.training.updates.ppo import PpoUpdate
 
 Arrays = dict[str, NDArray[Any]]
@@ -43,16 +43,16 @@ class OnPolicyRollouts(Rollouts):
         every = model.sde_sample_freq if model.use_sde else 0
         self.env.start(model.n_steps, Exploration(stochastic=True, sde_every=max(every, 0)))
 
-    def finish(self, check: Check | None) -> None:
+    def finish(self, watch: SegmentWatch | None) -> None:
         """Wait for the segment and write it into SB3's rollout buffer."""
-        segment = self.env.finish(check)
+        segment = self.env.finish(watch)
         self.model.num_timesteps += segment.reward.size
         self._fill_buffer(segment)
         self.finish_segment(segment)
 
     def learn(self) -> None:
         """Run the updates of this segment."""
-        self._update.train()
+        self._updater.train()
 
     @torch.no_grad()
     def _fill_buffer(self, segment: SegmentArrays) -> None:
@@ -104,8 +104,8 @@ class OnPolicyRollouts(Rollouts):
 
     def _evaluate_actions(self, observations: Arrays, actions: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the values of observations and the log-probabilities of actions, shape (rows,)."""
-        if isinstance(self._update, PpoUpdate):
-            return self._update.evaluate(self._to_tensor(observations, slice(None)), actions)
+        if isinstance(self._updater, PpoUpdate):
+            return self._updater.evaluate(self._to_tensor(observations, slice(None)), actions)
         policy, chosen = self.model.policy, self._to_actions(actions)
         parts_of_batches = [
             policy.evaluate_actions(self._to_tensor(observations, rows), chosen[rows])[:2]

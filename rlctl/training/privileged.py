@@ -21,8 +21,6 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from rlctl.play.shared_arrays import CRITIC
 
-Parts = dict[str, NDArray[Any]]
-
 
 def widen_space(space: spaces.Space[Any], privileged: int) -> spaces.Space[Any]:
     """Return the space of observations that the critic sees: those of the actor, then so many unbounded numbers."""
@@ -33,7 +31,7 @@ def widen_space(space: spaces.Space[Any], privileged: int) -> spaces.Space[Any]:
     return spaces.Box(np.concatenate([space.low, -own]), np.concatenate([space.high, own]), dtype=np.float32)
 
 
-def widen(parts: Parts) -> Parts:
+def widen(parts: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Return observations by key with the critic's own elements after the actor's, along the last axis."""
     if CRITIC not in parts:
         return parts

@@ -109,7 +109,7 @@ class WorkerVecEnv(VecEnv):
         return np.concatenate(self._actions[env])
 
     def begin_episodes(self, episodes_started: Sequence[int], actions: Sequence[NDArray[Any]]) -> set[int]:
-        """Restore running episodes by replaying their actions; return the environments whose episode ended early."""
+        """Restore running episodes by repeating their actions; return the environments whose episode ended early."""
         self.episodes_started = list(episodes_started)
         seeds = [self._seed(env, number - 1) for env, number in enumerate(episodes_started)]
         episodes = dict(enumerate(zip(seeds, actions, strict=True)))
@@ -120,18 +120,18 @@ class WorkerVecEnv(VecEnv):
     def start(self, steps: int, exploration: Exploration) -> None:
         """Begin to play `steps` steps of each environment."""
         self._steps, self._is_playing = steps, True
-        self.workers.arrays.inside[:, 2] = -1
+        self.workers.arrays.call_row[:] = -1
         running, next_episodes = dict.fromkeys(range(self.num_envs), -1), dict(enumerate(self.episodes_started))
         rule = self._level_rule
         self.workers.start_playing(
             Play(steps, running, next_episodes, self.run_seed, rule, exploration, taught=self.taught)
         )
 
-    def finish(self, check: Callable[[], None] | None = None) -> SegmentArrays:
-        """Wait for the steps that `start` began; `check` is called several times a second."""
+    def finish(self, watch: Callable[[], None] | None = None) -> SegmentArrays:
+        """Wait for the steps that `start` began; `watch` is called several times a second."""
         began = time.monotonic()
         try:
-            ended = self.workers.finish_playing(check=check)
+            ended = self.workers.finish_playing(watch=watch)
         except EpisodeFailed as error:
             error.actions = self._failed_actions(error)
             raise
@@ -172,14 +172,14 @@ class WorkerVecEnv(VecEnv):
     @property
     def steps_in_segment(self) -> int:
         """How many steps of the segment that is being played were begun so far, by all environments."""
-        return int((self.workers.arrays.inside[:, 2] + 1).sum()) if self._is_playing else 0
+        return int((self.workers.arrays.call_row + 1).sum()) if self._is_playing else 0
 
     def last_observations(self) -> dict[str, NDArray[Any]]:
         """Return the last observations, by key, of all segments that were finished, shape (n_envs, ...)."""
         arrays = self.workers.arrays
         observations = {key: array.copy() for key, array in arrays.observation.items()}
         if self._is_playing:
-            begun = arrays.inside[:, 2] >= 0  # row 0 was written before; those done have replaced the other
+            begun = arrays.call_row >= 0  # row 0 was written before; those done have replaced the other
             for key, array in observations.items():
                 array[begun] = arrays.segment.observation[key][begun, 0]
         return observations
@@ -187,7 +187,7 @@ class WorkerVecEnv(VecEnv):
     def _failed_actions(self, error: EpisodeFailed) -> NDArray[Any]:
         """Return the actions of a failed episode; the last is that of the failed step."""
         arrays = self.workers.arrays
-        rows = int(arrays.inside[error.env, 2]) + 1
+        rows = int(arrays.call_row[error.env]) + 1
         if error.step <= rows:
             return arrays.segment.action[error.env, rows - error.step : rows].copy()
         return np.concatenate([self.join_actions(error.env), arrays.segment.action[error.env, :rows]])
@@ -226,7 +226,7 @@ class WorkerVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-Check = Callable[[], None]  # called several times a second while workers play; may raise to stop
+SegmentWatch = Callable[[], None]  # called several times a second while workers play; may raise to stop
 Statistics = dict[str, tuple[NDArray[Any], NDArray[Any]]]
 """Mean and variance per normalised observation, "" for one that is not a dict."""
 
@@ -242,36 +242,37 @@ class Rollouts(abc.ABC):
         self.env = env
         self._algo = recipe.algo
         self._progress = progress
-        self._update = choose_update(model)
+        self._updater = choose_update(model)
         self._policy_info: PolicyInfo | None = None
         self._mirror = Mirror(model.mirror[0]) if hasattr(model, "mirror") else None  # of observations
         self.rehearse: Callable[[int], None] = lambda updates: None  # called after so many off-policy updates
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare the model to learn up to a step; start the first episodes of a new training."""
+        # It resets the environments if `_last_obs` is None; a resume has set it, with the episodes that ran.
         self.model._setup_learn(total_timesteps - self.model.num_timesteps, None, reset_num_timesteps=False)
 
-    def advance(self, check: Check | None = None) -> None:
+    def advance(self, watch: SegmentWatch | None = None) -> None:
         """Play a segment and learn: from this segment, or with overlap from earlier ones."""
         self.model.policy.set_training_mode(False)
         self.start()
         if self.overlap:
             self.learn()
-        self.finish(check)
+        self.finish(watch)
         if not self.overlap:
             self.learn()
 
     def close(self) -> None:
         """End the learner's processes."""
-        if self._update is not self.model:
-            self._update.close()
+        if self._updater is not self.model:
+            self._updater.close()
 
     @abc.abstractmethod
     def start(self) -> None:
         """Let the workers start to play with the current policy."""
 
     @abc.abstractmethod
-    def finish(self, check: Check | None) -> None:
+    def finish(self, watch: SegmentWatch | None) -> None:
         """Wait for the segment, and store it in the model's buffer."""
 
     @abc.abstractmethod

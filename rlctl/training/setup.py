@@ -205,7 +205,6 @@ def _open_run(
     for note in start.notes:
         display.message(note)
     if start.checkpoint is not None:
-        callbacks.start(resumed_at=start.step)
         display.message(checkpoints.restore(start.checkpoint, start.inexact))
     for warning in checkpoints.cut_back(start.step) if start.run else ():
         display.message(warning)

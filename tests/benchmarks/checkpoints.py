@@ -151,7 +151,7 @@ def _saved() -> tuple[float, float, float]:
     from gymnasium import spaces
     from stable_baselines3.common.buffers import ReplayBuffer
 
-    from rlctl.training.checkpoint_file import ReplaySegments
+    from rlctl.training.checkpoint_file import ReplayParts
 
     box = spaces.Box(-1, 1, (_SIZE,), np.float32)
     buffer = ReplayBuffer(_TRANSITIONS, box, spaces.Box(-1, 1, (8,), np.float32))
@@ -160,12 +160,12 @@ def _saved() -> tuple[float, float, float]:
         values[...] = rng.random(values.shape, np.float32)
     last = _TRANSITIONS + 10 * _NEW
     with tempfile.TemporaryDirectory() as folder:
-        segments = ReplaySegments(Path(folder), buffer)
-        segments.save(_TRANSITIONS)
-        saves = [_timed(segments.save, added) for added in range(_TRANSITIONS + _NEW, last, _NEW)]
-        named = segments.save(last)
+        parts = ReplayParts(Path(folder), buffer)
+        parts.save(_TRANSITIONS)
+        saves = [_timed(parts.save, added) for added in range(_TRANSITIONS + _NEW, last, _NEW)]
+        named = parts.save(last)
         pickled = _timed(_pickle, buffer, Path(folder) / "buffer.pkl")
-        return statistics.median(saves), pickled, _timed(segments.load, named, last)
+        return statistics.median(saves), pickled, _timed(parts.load, named, last)
 
 
 def _pickle(buffer, file: Path) -> None:

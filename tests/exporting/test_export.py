@@ -10,8 +10,9 @@ import torch
 
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.exporting.export import export_policy, format_closed_loop, show
+from rlctl.exporting.export import export_policy
 from rlctl.exporting.export_request import ExportRequest
+from rlctl.exporting.report import format_closed_loop, show
 from rlctl.exporting.verify import Comparison, compare_episodes, verify
 from rlctl.play.collect import Episode
 from rlctl.play.messages import EpisodeResult

@@ -25,7 +25,7 @@ def replay_buffer(run: RunDirectory, segments) -> dict:
     """Return the transitions by number, as they are after all segments."""
     transitions = {}
     for segment in segments:
-        arrays = load_file(run.replay_segments / segment.name)
+        arrays = load_file(run.replay_parts / segment.name)
         for place, number in enumerate(range(segment.first, segment.last)):
             transitions[number] = {name: array[place] for name, array in arrays.items()}
     return transitions

@@ -97,9 +97,9 @@ def kill_after(monkeypatch):
             asked = count
             started(env, count, exploration)
 
-        def finish(env, check=None):
+        def finish(env, watch=None):
             nonlocal done
-            segment = finished(env, killed if done + asked > steps else check)  # while the workers play
+            segment = finished(env, killed if done + asked > steps else watch)  # while the workers play
             done += segment.reward.shape[1]
             return segment
 

@@ -12,7 +12,7 @@ from rlctl.recipe.recipe import merge
 from rlctl.task.history import TermHistory
 from rlctl.task.layout import Layout
 from rlctl.training import algorithms
-from rlctl.training.checkpoint_file import ReplaySegments
+from rlctl.training.checkpoint_file import ReplayParts
 from rlctl.training.stacked_replay import StackedRows, Stacking, store_once
 from tests.training.envs import Image, Line
 
@@ -103,9 +103,9 @@ def test_saved_and_loaded(tmp_path, steps, start):
     ours, theirs = (make_buffer(ReplayBuffer, once=once, start=start) for once in (True, False))
     played = list_steps(steps + 30, start)
     play([ours, theirs], played[:steps])
-    segments = ReplaySegments(tmp_path, ours).save(steps)
+    parts = ReplayParts(tmp_path, ours).save(steps)
     restored = make_buffer(ReplayBuffer, once=True, start=start)
-    ReplaySegments(tmp_path, restored).load(segments, steps)
+    ReplayParts(tmp_path, restored).load(parts, steps)
     assert_same_samples(restored, theirs)
     for first in (steps, steps + 1, steps + 15):  # the oldest transitions are replaced one after the other
         play([restored, theirs], played[first : first + (1 if first == steps else 14)])

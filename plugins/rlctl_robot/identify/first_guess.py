@@ -26,7 +26,7 @@ from rlctl_robot.identify.robot_model import (
     Values,
 )
 
-Rows = NDArray[np.int64]
+LogRows = NDArray[np.int64]
 
 _SMOOTHING_S = 0.12  # of positions, for velocities and accelerations
 _SLOW = 0.05  # [rad/s or m/s], below which the sign of a velocity is uncertain
@@ -65,7 +65,7 @@ def differentiate(motion: ServoLog) -> Derivatives:
 class Regression:
     """Explains a log's differences of targets and positions by torques and friction, joint by joint."""
 
-    def __init__(self, robot: RobotModel, motion: ServoLog, rows: Rows) -> None:
+    def __init__(self, robot: RobotModel, motion: ServoLog, rows: LogRows) -> None:
         """`rows` are those that may be used."""
         self.robot, self.motion = robot, motion
         derivatives = differentiate(motion)

@@ -103,7 +103,7 @@ class ControllerInterface(Interface):
     def __init__(self, env: Any, info: EnvInfo) -> None:
         super().__init__(env, info)
         self._controller = ControllerPlan(info)
-        self._target = self._controller.find_target(None)
+        self._target = self._controller.target
         self.shapes = {part.name: (part.size,) for part in self._controller.quantities}
         self.units = {part.name: part.unit for part in self._controller.quantities if part.unit}
         if self._target is not None:

@@ -30,15 +30,9 @@ from rlctl.exporting.controller.graph import build_graph
 from rlctl.exporting.controller.plan import ControllerPlan, JointTarget
 from rlctl.exporting.controller.program_mapping import NO_MAPPING, ProgramMapping, read_mapping
 from rlctl.exporting.controller.source import ControllerSource
-from rlctl.exporting.export import (
-    ExportReport,
-    check_environment,
-    check_verified,
-    describe_policy,
-    explain_unverifiable,
-    find_source,
-)
 from rlctl.exporting.export_request import ExportRequest
+from rlctl.exporting.exported_policy import check_environment, explain_unverifiable, find_source
+from rlctl.exporting.report import ExportReport, ReportRow, check_verified, describe_policy
 from rlctl.exporting.verify import Latency, change_last_bits, measure_sb3
 from rlctl.limits.doubts import list_doubts
 from rlctl.limits.limits import Limits, read_limits
@@ -56,20 +50,23 @@ class ControllerReport(ExportReport):
 
     max_target_difference: float | None = None
 
-    def list_rows(self) -> list[tuple[str, str]]:
-        """Return the lines of the report: pairs of a word and a text."""
-        details, rows = self.details, super().list_rows()
-        target = [("target", text)] if (text := details["target"]) else []
-        target += [("mapping", f"{name}: {text}") for name, text in details["mapping"].items()]
-        if "opset" in details:  # for a robot's program, not for `rlctl eval`
-            rows = rows[:-1]
+    def list_rows(self) -> list[ReportRow]:
+        """Return the lines of the report."""
+        details, rows = self.details, self.group_rows()
+        inputs, checks, end = rows.inputs, [*rows.checks, *rows.latency], rows.following
+        if "opset" in details:  # for a robot's program: `rlctl eval` is not next
+            checks, end = rows.checks, rows.latency
         else:
-            sizes = ", ".join(f"{name}[{size}]" for name, size in details["input_sizes"].items())
-            rows = [*rows[:2], ("inputs", sizes), *rows[2:]]
-        cost = details.get("limits_cost")
-        costs = [] if cost is None else [("their cost", str(cost))]
-        example = [("example", f"{path}: inputs and outputs of {ROWS} steps")] if (path := details["example"]) else []
-        return [*rows[:3], *target, ("limits", details["limits"]), *costs, *rows[3:-1], *example, *rows[-1:]]
+            inputs = [("inputs", ", ".join(f"{name}[{size}]" for name, size in details["input_sizes"].items()))]
+        targets = [("target", details["target"])] if details["target"] else []
+        mappings = [("mapping", f"{name}: {text}") for name, text in details["mapping"].items()]
+        limits = [("limits", details["limits"])]
+        if details.get("limits_cost") is not None:
+            limits.append(("their cost", str(details["limits_cost"])))
+        example: list[ReportRow] = []
+        if details["example"]:
+            example = [("example", f"{details['example']}: inputs and outputs of {ROWS} steps")]
+        return [*rows.file, *inputs, *targets, *mappings, *limits, *rows.interface, *checks, *example, *end]
 
 
 def export_controller(request: ExportRequest) -> list[ExportReport]:
@@ -125,7 +122,7 @@ class _Export:
         model = build_graph(self.policy, self.plan, self.mapping)
         content = encode(model)
         controller = OnnxController(content)
-        target = self.plan.find_target(None)
+        target = self.plan.target
         fields, recorded = self._verify(path, controller, target, is_limited=False)
         inputs = recorded[0].inputs[0]
         median = float(np.median(timeit.repeat(lambda: controller.step(inputs), number=1, repeat=330)[30:])) * 1e6

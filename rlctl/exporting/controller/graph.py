@@ -37,7 +37,7 @@ class _Writer:
     def __init__(self, policy: PolicyFile, plan: ControllerPlan, mapping: ProgramMapping) -> None:
         self._policy, self._graph, self._mapping = policy, Graph(), mapping
         self._plan = plan
-        self._target = self._plan.find_target(None)
+        self._target = self._plan.target
         self._inputs = {part.name: self._add_input(part) for part in self._plan.quantities}
         self._inputs |= {name: self._map_input(name, one) for name, one in mapping.inputs.items()}
         self._states: list[str] = []

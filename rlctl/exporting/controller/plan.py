@@ -1,6 +1,7 @@
 """What a controller takes, computes and returns: quantities, terms, histories and joint targets of one environment."""
 
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Iterable, Mapping
@@ -15,7 +16,7 @@ from rlctl.environments.info import AnyTerm, EnvInfo, space_to_json
 from rlctl.errors import RecipeError, UsageError
 from rlctl.limits.fitting import FittedLimits
 from rlctl.policy.c_policy import observation_type
-from rlctl.task.joints import Command
+from rlctl.task.joints import CommandKind
 from rlctl.task.layout import Layout, Part
 from rlctl.task.terms import ClipOrientation, Gravity, Internal, Playback, Scaled
 
@@ -61,7 +62,7 @@ class Observed(Part):
 class JointTarget:
     """What an action commands: `base + factor * action`."""
 
-    kind: Command
+    kind: CommandKind
     factor: NDArray[np.float64]
     default: NDArray[np.float64]  # of positions; zeros for the other kinds
     measured: int  # where the inputs have the joints' positions, for steps
@@ -144,21 +145,13 @@ class ControllerPlan:
         self.action_size = math.prod(action_space.shape)
         self.repeats_first = env.history_start == "first"
         self.frames = frames
-        layout = Layout(self._find_sizes(), env.observation_history)
+        layout = Layout(env.find_sizes(frames), env.observation_history)
         self.newest_size, self.size = layout.newest_size, layout.size * frames
         self.observed = [self._describe(part) for part in layout.parts]
         self.quantities = self._list_quantities()
         self.input_size = sum(quantity.size for quantity in self.quantities)
         if not self.quantities:
             raise UsageError("--controller: the policy observes nothing that a robot measures")
-
-    def _find_sizes(self) -> dict[str, int]:
-        """Return the elements of each name of a single observation, without a stack of them."""
-        sizes = self.env.observation_sizes
-        if SINGLE not in self.parts:
-            sizes = {key: math.prod(part.shape or ()) for key, part in self.parts.items()}
-        total = sum(math.prod(part.shape or ()) for part in self.parts.values()) // self.frames
-        return sizes if sum(sizes.values()) == total else {"observation": total}
 
     def _describe(self, part: Part) -> Observed:
         key = part.name if part.name in self.parts else SINGLE
@@ -234,8 +227,13 @@ class ControllerPlan:
                 return quantity
         raise UsageError(f"--controller: no input has the joints' positions: {name!r} is computed inside")
 
+    @functools.cached_property
+    def target(self) -> JointTarget | None:
+        """What an action commands, without limits, if the task describes it."""
+        return self.find_target(None)
+
     def find_target(self, fitted: FittedLimits | None) -> JointTarget | None:
-        """Return what an action commands within limits, if the task describes it.
+        """Return what an action commands within limits, if the task describes it; without any it is `target`.
 
         Raises `RecipeError` for limits with other units than the task has.
         """

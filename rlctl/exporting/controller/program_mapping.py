@@ -126,7 +126,7 @@ def read_mapping(path: Path, plan: ControllerPlan) -> ProgramMapping:
 
     Raises `RecipeError` for a mapping that does not fit the policy, `UsageError` for what a controller cannot do.
     """
-    mapping, target = yaml_text.read_model(path, MappingFile), plan.find_target(None)
+    mapping, target = yaml_text.read_model(path, MappingFile), plan.target
     if mapping.actions is not None and mapping.targets is None:
         instead = "the controller returns targets of joints: map them with targets:"
         if target is None:

@@ -65,7 +65,7 @@ class ControllerSource:
         self.limits = fitted.limits
         assert fitted.bounds is not None  # the actions are in a Box
         self._limits_source = LimitsSource(self.limits, fitted, fitted.bounds)
-        self.target = plan.find_target(None if limits is None else fitted)
+        self.target = plan.target if limits is None else plan.find_target(fitted)
         self.name = c_source.make_identifier(file_name)
         self._tables = CTables()
         self._values = self._describe(policy)
@@ -94,7 +94,8 @@ class ControllerSource:
             "upper": self.name.upper(),
             "version": __version__,
             "info": policy.info,
-            "plan": _WithActions(plan, described),
+            "plan": plan,
+            "action_lines": described.describe_action(),
             "limits": self._limits_source,
             "kind": described.type,
             "type": described.action_type,
@@ -243,13 +244,3 @@ class ControllerSource:
         for name, array in numbers.items():
             arrays.append(("double", name, "ACTION_SIZE", [write_number(value, "double") for value in array]))
         return arrays
-
-
-class _WithActions:
-    """The plan as the templates read it: of the controller and, for the action, of the policy."""
-
-    def __init__(self, plan: ControllerPlan, described: CFunction) -> None:
-        self._plan, self.describe_action = plan, described.describe_action
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._plan, name)

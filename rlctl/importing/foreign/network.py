@@ -149,13 +149,13 @@ class NotImportable(ValueError):
         self.in_no_form = in_no_form
 
 
-Layer = tuple[str, Any]
+ForeignLayer = tuple[str, Any]
 """`("linear", ForeignLinear)`, `("affine", (factor, shift))`, an activation's name and None, `("first", count)` for so
 many of the values, or `("part", count)` for the first of so many equal parts of them."""
 
 
 def assemble(
-    layers: Sequence[Layer], activations: Mapping[str, Any], lstm: ForeignLstm | None = None
+    layers: Sequence[ForeignLayer], activations: Mapping[str, Any], lstm: ForeignLstm | None = None
 ) -> ForeignNetwork:
     """Return the network of layers in a row; raises `NotImportable` where they are no perceptron.
 

@@ -13,10 +13,10 @@ from rlctl.errors import ArtifactError, short_repr
 from rlctl.importing.foreign.network import (
     LARGEST_FILE,
     Array,
+    ForeignLayer,
     ForeignLinear,
     ForeignLstm,
     ForeignNetwork,
-    Layer,
     NotImportable,
     assemble,
 )
@@ -165,7 +165,7 @@ class _ChainReader:
 
     def __init__(self, constants: dict[str, NDArray[Any]]) -> None:
         self.constants = constants
-        self.values: dict[str, list[Layer]] = {}
+        self.values: dict[str, list[ForeignLayer]] = {}
         self.of_clip: set[str] = set()  # values from which a row of a clip is read, which no action depends on
 
     def read(self, node: onnx.NodeProto) -> None:
@@ -205,14 +205,14 @@ class _ChainReader:
         else:
             raise NotImportable(f"its graph has the operator {node.op_type} on constants")
 
-    def _join(self, node: onnx.NodeProto, moving: list[str]) -> list[Layer]:
+    def _join(self, node: onnx.NodeProto, moving: list[str]) -> list[ForeignLayer]:
         one, other = (self.values[name] for name in moving)
         for plain, gate in ((one, other), (other, one)):
             if node.op_type == "Mul" and gate == [*plain, (_SIGMOID, None)]:
                 return [*plain, ("silu", None)]
         raise NotImportable(f"its graph joins two branches with {node.op_type}")
 
-    def _describe(self, node: onnx.NodeProto, given: str, attributes: dict[str, Any]) -> list[Layer]:
+    def _describe(self, node: onnx.NodeProto, given: str, attributes: dict[str, Any]) -> list[ForeignLayer]:
         kind = node.op_type
         others = [self._get(name) for name in node.input if name not in (given, "")]
         if kind in _PASSED_ON or (kind == "Reshape" and len(others) == 1):
@@ -261,7 +261,7 @@ def _read_gemm(others: list[NDArray[Any]], attributes: dict[str, Any]) -> Foreig
 
 
 def _read_lstm(
-    layers: list[Layer],
+    layers: list[ForeignLayer],
     node: onnx.NodeProto,
     get: Callable[[str], NDArray[Any]],
     attributes: dict[str, Any],

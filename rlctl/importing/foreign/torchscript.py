@@ -17,10 +17,10 @@ from rlctl.errors import ArtifactError, short_repr
 from rlctl.importing.foreign.network import (
     LARGEST_FILE,
     Array,
+    ForeignLayer,
     ForeignLinear,
     ForeignLstm,
     ForeignNetwork,
-    Layer,
     NotImportable,
     assemble,
 )
@@ -105,9 +105,9 @@ def _find_forward(module: Module) -> str:
     return body if end < 0 else body[:end]
 
 
-def _list_layers(module: Module) -> list[Layer]:
+def _list_layers(module: Module) -> list[ForeignLayer]:
     """Return the layers of a `Sequential`, in the order of its numbers, or of a graph, in the order of its calls."""
-    layers: list[Layer] = []
+    layers: list[ForeignLayer] = []
     for name in _list_names(module):
         part = module.modules[name]
         kind = _find_class(part)

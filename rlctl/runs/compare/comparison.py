@@ -19,7 +19,7 @@ from rlctl.evaluation.evaluate import Evaluation, run_evaluation
 from rlctl.recipe.recipe import NOT_SET, Recipe, find_difference, find_mixed
 from rlctl.runs.compare.margin import check_margin
 from rlctl.runs.compare.policy_alone import PolicyAlone, find_same_policy, reports_success
-from rlctl.runs.compare.significance import MeanDifference, Quantity, Verdict, compare_episodes, compare_seeds
+from rlctl.runs.compare.significance import ComparedQuantity, MeanDifference, Verdict, compare_episodes, compare_seeds
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.lookup import describe_source_change
@@ -41,7 +41,7 @@ class EvaluatedRun:
     steps_to_threshold: int | None
     seconds_to_threshold: float | None
 
-    def values(self, quantity: Quantity) -> NDArray[np.float64]:
+    def values(self, quantity: ComparedQuantity) -> NDArray[np.float64]:
         """Return the success (0 or 1) or return of each episode, shape (episodes,); NaN where it is not reported."""
         results = [episode.result for episode in self.evaluation.played]
         values = [result.success if quantity == "success" else result.total_reward for result in results]
@@ -72,7 +72,7 @@ class Side:
         """Whether the task reports success, and no episode of any run succeeded."""
         return all(run.evaluation.success_rate == 0 for run in self.runs)
 
-    def scores(self, quantity: Quantity) -> NDArray[np.float64]:
+    def scores(self, quantity: ComparedQuantity) -> NDArray[np.float64]:
         """Return each run's mean over its episodes, shape (runs,)."""
         return np.array([np.nanmean(run.values(quantity)) for run in self.runs], np.float64)
 
@@ -82,7 +82,7 @@ class Candidate:
     """A side that is compared with the baseline, and the differences in scores and recipe."""
 
     side: Side
-    differences: Mapping[Quantity, MeanDifference]  # `success`, where the task reports it, then `return`
+    differences: Mapping[ComparedQuantity, MeanDifference]  # `success`, where the task reports it, then `return`
     recipe_changes: dict[str, tuple[Any, Any]] | None
     """Per dotted key the value here and the baseline's; None where a recipe is not known."""
     same_policy: str = ""  # sha256 of the policy file, if it is the baseline's too
@@ -325,8 +325,12 @@ def _default_threshold(threshold: float | None, has_success: bool) -> float | No
     return THRESHOLD if threshold is None and has_success else threshold
 
 
-def _differences(baseline: Side, side: Side, of_recipes: bool, comparisons: int) -> Mapping[Quantity, MeanDifference]:
-    quantities: list[Quantity] = ["success", "return"] if baseline.has_success and side.has_success else ["return"]
+def _differences(
+    baseline: Side, side: Side, of_recipes: bool, comparisons: int
+) -> Mapping[ComparedQuantity, MeanDifference]:
+    quantities: list[ComparedQuantity] = ["return"]
+    if baseline.has_success and side.has_success:
+        quantities = ["success", "return"]
     one, two = (
         {quantity: own.scores(quantity) if of_recipes else own.runs[0].values(quantity) for quantity in quantities}
         for own in (baseline, side)

@@ -86,7 +86,7 @@ def _format_seed(run: EvaluatedRun) -> tuple[str, ...]:
     return (_or_dash(run.seed, ""), *_format_scores(run), *reached)
 
 
-def _format_aggregate(side: Side, quantity: significance.Quantity) -> str:
+def _format_aggregate(side: Side, quantity: significance.ComparedQuantity) -> str:
     """Return `success mean 97.0%, IQM 97.5% (95 % interval 95.0% to 99.0%)`; of few seeds their range."""
     scores = side.scores(quantity)
     spread, interval = Spread.of(scores.tolist()), significance.interquartile_mean_interval(scores)
@@ -108,7 +108,7 @@ def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]
     return lines
 
 
-def _format_difference(quantity: significance.Quantity, difference: significance.MeanDifference) -> str:
+def _format_difference(quantity: significance.ComparedQuantity, difference: significance.MeanDifference) -> str:
     """Return `success: +3.0 points (95 % interval +1.0 to +5.0), p = 0.012`; points are percentage points."""
     scale, form, unit = (100, "+.1f", " points") if quantity == "success" else (1, "+.4g", "")
     mean, low, high = (format(scale * value, form) for value in (difference.mean, difference.low, difference.high))

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Quantity = Literal["success", "return"]
+ComparedQuantity = Literal["success", "return"]
 Array = NDArray[np.float64]
 
 ALPHA = 0.05  # a difference is significant below this p-value; intervals have the level 1 - ALPHA
@@ -63,8 +63,8 @@ class SeedDifference(MeanDifference):
 
 
 def compare_episodes(
-    baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
-) -> dict[Quantity, MeanDifference]:
+    baseline: Mapping[ComparedQuantity, Array], candidate: Mapping[ComparedQuantity, Array], comparisons: int = 1
+) -> dict[ComparedQuantity, MeanDifference]:
     """Compare two policies by success and return on the same episodes, each of shape (episodes,), NaN where unknown.
 
     `comparisons` is how many candidates are compared with this baseline; p-values are adjusted by Bonferroni.
@@ -84,8 +84,8 @@ def compare_episodes(
 
 
 def compare_seeds(
-    baseline: Mapping[Quantity, Array], candidate: Mapping[Quantity, Array], comparisons: int = 1
-) -> dict[Quantity, SeedDifference]:
+    baseline: Mapping[ComparedQuantity, Array], candidate: Mapping[ComparedQuantity, Array], comparisons: int = 1
+) -> dict[ComparedQuantity, SeedDifference]:
     """Compare two recipes by the final scores of their training seeds, each of shape (seeds,); see `compare_episodes`.
 
     Two seeds or more each. The interval of the difference of means is Welch's, because a bootstrap of few seeds is

@@ -19,7 +19,7 @@ from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.runs.diagnosis import usual_ranges
 from rlctl.runs.diagnosis.usual_ranges import Setting
 from rlctl.runs.directory import RunDirectory
-from rlctl.runs.tables import Rows, list_points, read_table
+from rlctl.runs.tables import TableRows, list_points, read_table
 
 Array = NDArray[np.float64]
 _Record = TypeVar("_Record")
@@ -154,5 +154,5 @@ def _read(function: Callable[..., _Record], *arguments: Path) -> _Record | None:
         return None
 
 
-def _curve(rows: Rows, name: str) -> Curve:
+def _curve(rows: TableRows, name: str) -> Curve:
     return Curve(*np.array(list_points(rows, name), np.float64).reshape(-1, 2).T)

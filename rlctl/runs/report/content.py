@@ -20,7 +20,7 @@ from rlctl.runs.directory import is_group
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.recipe_names import name_recipes
 from rlctl.runs.report.show import RunDescription, list_changes
-from rlctl.runs.tables import Rows, list_points
+from rlctl.runs.tables import TableRows, list_points
 
 _GOOD_SUCCESS = 0.5
 _TIME = re.compile(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d")  # what rlctl names runs and groups by
@@ -302,7 +302,7 @@ def _outcome(episode: RecordedEpisode) -> str:
     return f"{success}return {episode.info.total_reward:.4g}, {len(episode.rewards)} steps"
 
 
-def mean_curve(tables: Sequence[Rows], column: str, points: int = 200) -> dict[str, Any] | None:
+def mean_curve(tables: Sequence[TableRows], column: str, points: int = 200) -> dict[str, Any] | None:
     """Return steps, mean, lowest and highest over several tables at common steps; None without a value.
 
     All of one shape, at most (points,); the rows of a single table are averaged down to `points`. Where a table ends

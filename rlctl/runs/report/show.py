@@ -22,7 +22,7 @@ from rlctl.runs.listing import as_json
 from rlctl.runs.lookup import describe_source_change
 from rlctl.runs.report.audited import list_lines, read_audit
 from rlctl.runs.summary import RunSummary, summarize
-from rlctl.runs.tables import Rows, list_points
+from rlctl.runs.tables import TableRows, list_points
 
 _EVALUATIONS_SHOWN = 12
 _POOR_SUCCESS = 0.5  # below, the policy has learned something else
@@ -169,7 +169,7 @@ def plot(run: RunDescription, name: str) -> str:
     return str(plotext.uncolorize(plotext.build()))
 
 
-def _show_evaluations(rows: Rows) -> None:
+def _show_evaluations(rows: TableRows) -> None:
     shown = rows[-_EVALUATIONS_SHOWN:]
     if len(rows) > len(shown):
         output.out().print(f"the last {len(shown)} of {len(rows)} evaluations:")
@@ -180,7 +180,7 @@ def _show_evaluations(rows: Rows) -> None:
     output.print_table(columns, cells, drop=[name for name in reversed(columns) if name not in _ALWAYS_SHOWN])
 
 
-def tabulate(rows: Rows) -> tuple[list[str], list[list[str]]]:
+def tabulate(rows: TableRows) -> tuple[list[str], list[list[str]]]:
     """Return the columns that have values in a table of evaluations, and the cells of its rows."""
     columns = [name for name in (rows[0] if rows else {}) if any(row.get(name) is not None for row in rows)]
     return columns, [[_format_cell(name, row.get(name)) for name in columns] for row in rows]

@@ -15,22 +15,22 @@ from rlctl.runs.compare.report import describe_candidate, describe_seeds, descri
 from rlctl.runs.report import content
 from rlctl.runs.report.content import RunReport
 from rlctl.runs.report.show import describe_robustness, tabulate
-from rlctl.runs.tables import Rows
+from rlctl.runs.tables import TableRows
 from rlctl.storage import files
 
 _PICTURES = 6  # of an episode
 PICTURES: tuple[Literal["svg", "pdf", "png"], ...] = ("svg", "pdf", "png")  # formats of curves alone
 
 
-Form = Literal["html", "md", "table", "csv", "latex", "svg", "pdf", "png"]
-_SUFFIXES: dict[str, Form] = {".html": "html", ".csv": "csv", ".tex": "latex"}
+ReportForm = Literal["html", "md", "table", "csv", "latex", "svg", "pdf", "png"]
+_SUFFIXES: dict[str, ReportForm] = {".html": "html", ".csv": "csv", ".tex": "latex"}
 _SUFFIXES |= {f".{form}": form for form in PICTURES}
 _EPISODES = 100
 
 
 def write_report(
     runs: Sequence[str],
-    form: Form | None = None,
+    form: ReportForm | None = None,
     target: Path | None = None,
     *,
     pictures: bool = True,
@@ -65,7 +65,7 @@ def write_report(
     return _write_text(text, path if is_html else target)
 
 
-def _choose_form(form: Form | None, target: Path | None) -> Form:
+def _choose_form(form: ReportForm | None, target: Path | None) -> ReportForm:
     suffix = None if target is None else _SUFFIXES.get(target.suffix)
     if form is None:
         return suffix or "html"
@@ -74,7 +74,7 @@ def _choose_form(form: Form | None, target: Path | None) -> Form:
     return form
 
 
-def _refuse_options(form: Form, *, pictures: bool, episodes: int | None, labels: Sequence[str]) -> None:
+def _refuse_options(form: ReportForm, *, pictures: bool, episodes: int | None, labels: Sequence[str]) -> None:
     ignored = []
     if not pictures and form != "html":
         ignored.append("--no-pictures")
@@ -86,7 +86,7 @@ def _refuse_options(form: Form, *, pictures: bool, episodes: int | None, labels:
         raise UsageError(f"{ignored[0]} has no effect with the format {form}: leave it out")
 
 
-def _format_results(report: RunReport, form: Form) -> str:
+def _format_results(report: RunReport, form: ReportForm) -> str:
     from rlctl.runs.report import results
 
     rows = results.list_results(report)
@@ -172,7 +172,7 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
     return verdicts, [f"all runs were evaluated with the baseline's {', '.join(worlds)}"] if worlds else []
 
 
-def _split_terms(rows: Rows) -> list[tuple[list[str], list[list[str]]]]:
+def _split_terms(rows: TableRows) -> list[tuple[list[str], list[list[str]]]]:
     """Return the table of evaluations, and that of the reward terms if there are any, as columns and cells."""
     main = [{name: value for name, value in row.items() if not name.startswith("term/")} for row in rows]
     terms = [{name: value for name, value in row.items() if name.startswith(("term/", "steps"))} for row in rows]

@@ -10,12 +10,12 @@ from typing import Annotated
 import numpy as np
 
 from rlctl.errors import TaskError
-from rlctl.task.camera import SHAPES, Distractor, Shape
+from rlctl.task.camera import SHAPES, Distractor, ShapeName
 from rlctl.task.events.event import (
     Drawn,
     Fraction,
     NotNegative,
-    Parts,
+    ObservationParts,
     Positive,
     Range,
     RangeLimits,
@@ -211,7 +211,7 @@ def set_distractors(
     shown = []
     for _ in range(drawn):
         x, y, _ = _horizontal(float(rng.uniform(*distance)), float(rng.uniform(-math.pi, math.pi)))
-        shape: Shape = SHAPES[int(rng.integers(len(SHAPES)))]
+        shape: ShapeName = SHAPES[int(rng.integers(len(SHAPES)))]
         sides = rng.uniform(*size, 3)
         if shape != "box":
             sides[1:] = sides[0]
@@ -295,7 +295,7 @@ def _horizontal(length: float, direction: float) -> tuple[float, float, float]:
 
 
 @acts_at("observation", "action", std=0.0)
-def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
+def noise(rng: Rng, first: ObservationParts, *, std: NotNegative) -> tuple[Drawn, Signal]:
     """Add normal noise to every element at every step.
 
     Its standard deviation, in the unit of the observation or the action, is drawn once per episode.
@@ -304,7 +304,7 @@ def noise(rng: Rng, first: Parts, *, std: NotNegative) -> tuple[Drawn, Signal]:
 
 
 @acts_at("observation", "action", steps=0.0)
-def delay(rng: Rng, first: Parts, *, steps: Steps) -> tuple[Drawn, Signal]:
+def delay(rng: Rng, first: ObservationParts, *, steps: Steps) -> tuple[Drawn, Signal]:
     """Delay all values by some control steps; the number is drawn once per episode, both ends included.
 
     In these first steps the observation is the first of the episode, and the action is 0 or the nearest to 0.

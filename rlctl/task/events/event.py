@@ -93,8 +93,8 @@ def _is_number(value: Any) -> bool:
 
 When = Literal["reset", "start", "interval", "observation", "action"]
 Drawn = dict[str, float]
-Parts = dict[str, NDArray[Any]]
-Signal = Callable[[Parts], Parts]
+ObservationParts = dict[str, NDArray[Any]]
+Signal = Callable[[ObservationParts], ObservationParts]
 """Changes the values of a control step, by name: a sensor or a motor with noise or delay."""
 
 Change = Callable[..., Drawn]

@@ -8,9 +8,10 @@ from gymnasium import spaces
 
 from rlctl.errors import TaskError, check_name, in_world
 from rlctl.task.events.acting import Streams, check_drawn
-from rlctl.task.events.event import BoundEvent, Drawn, Parts, Signal, Widening
-from rlctl.task.events.world_signals import WORLD_SIGNALS, Array, Worlds
+from rlctl.task.events.event import BoundEvent, Drawn, ObservationParts, Signal, Widening
+from rlctl.task.events.world_signals import WORLD_SIGNALS, Array
 from rlctl.task.layout import Layout
+from rlctl.task.world_index import WorldIndex
 
 _ACTION = "action"
 
@@ -25,7 +26,7 @@ class Signals:
         self,
         worlds: int,
         events: Mapping[str, BoundEvent],
-        first: Parts,
+        first: ObservationParts,
         action_space: spaces.Space[Any],
         bounds: Mapping[str, tuple[float, float]],
     ) -> None:
@@ -48,7 +49,6 @@ class Signals:
                 self.on_action.append(_SignalEvent(event, worlds, {_ACTION: self._zero}))
         self._streams: list[Streams] = [{} for _ in range(worlds)]
         self._levels, self._is_new = np.ones(worlds), np.zeros(worlds, bool)
-        self._worlds = np.arange(worlds)
         self.drawn: list[dict[str, Drawn]] = [{} for _ in range(worlds)]
         """Per world the values drawn for its episode, by event."""
 
@@ -69,19 +69,18 @@ class Signals:
         with in_world(world):
             self.drawn[world][name] = acting.begin(world, self._streams[world][name], first, level)
 
-    def observe(self, parts: Parts, worlds: Worlds) -> Parts:
+    def observe(self, parts: ObservationParts, worlds: WorldIndex) -> ObservationParts:
         """Return observations of some worlds, each of shape (k, ...), with noise and delay."""
         if not self.on_observation:
             return parts
-        indices = self._worlds[worlds]
-        new = np.flatnonzero(self._is_new[indices]).tolist()
-        self._is_new[indices] = False
+        new = np.flatnonzero(self._is_new[worlds]).tolist()
+        self._is_new[worlds] = False
         parts = dict(parts)
         for acting in self.on_observation:
-            exact = [np.asarray(parts[name], np.float64).reshape(len(indices), -1) for name in acting.names]
+            exact = [np.asarray(parts[name], np.float64).reshape(len(worlds), -1) for name in acting.names]
             values = np.concatenate(exact, axis=1)
             for row in new:  # events on observations begin with the first one
-                self._start(acting, int(indices[row]), values[row])
+                self._start(acting, int(worlds[row]), values[row])
             changed = acting.layout.split(acting.change(values, worlds))
             for name, noisy in changed.items():
                 if name in self.bounds:
@@ -91,7 +90,7 @@ class Signals:
                 parts[name] = noisy.reshape(np.shape(parts[name]))
         return parts
 
-    def act(self, action: Any, worlds: Worlds) -> Any:
+    def act(self, action: Any, worlds: WorldIndex) -> Any:
         """Return the actions, shape (k, ...), that the motors of some worlds get; they stay inside the action space."""
         if not self.on_action:
             return action
@@ -101,7 +100,7 @@ class Signals:
             values = acting.change(values, worlds)
         return np.clip(values.reshape(action.shape), space.low, space.high).astype(space.dtype)
 
-    def try_once(self, first: Parts) -> dict[str, Drawn]:
+    def try_once(self, first: ObservationParts) -> dict[str, Drawn]:
         """Begin every signal once, to find mistakes; return the drawn values by event."""
         acting = [*self.on_observation, *self.on_action]
         self.begin(0, {signal.event.name: np.random.default_rng(0) for signal in acting}, 1.0)
@@ -112,7 +111,7 @@ class Signals:
 class _SignalEvent:
     """An event on observations or actions; a user's own function knows one world only and is called per world."""
 
-    def __init__(self, event: BoundEvent, worlds: int, first: Parts) -> None:
+    def __init__(self, event: BoundEvent, worlds: int, first: ObservationParts) -> None:
         self.event, self.names = event, list(first)
         self.layout = Layout({name: int(np.size(value)) for name, value in first.items()})
         self._shapes = {name: np.shape(value) for name, value in first.items()}
@@ -123,7 +122,6 @@ class _SignalEvent:
             largest = {name: max(value.start[1], value.end[1]) for name, value in ranges.items()}
             self._rows = kind(worlds, self.layout.size, largest)
         self._own: dict[int, Signal] = {}
-        self._worlds = np.arange(worlds)
 
     def begin(self, world: int, rng: np.random.Generator, first: Array, level: float) -> Drawn:
         """Begin the episode of a world, with its first values; return the drawn values."""
@@ -139,23 +137,23 @@ class _SignalEvent:
         check_drawn(self.event.name, drawn)
         return drawn
 
-    def change(self, values: Array, worlds: Worlds) -> Array:
+    def change(self, values: Array, worlds: WorldIndex) -> Array:
         """Return the values of some worlds, shape (k, size), with noise or delay."""
         if self._rows is not None:
             return self._rows(values, worlds)
         changed = np.empty(values.shape)
-        for row, world in enumerate(self._worlds[worlds].tolist()):
+        for row, world in enumerate(worlds.tolist()):
             with in_world(world):
                 parts = self._own[world](self._split(values[row]))
                 changed[row] = np.concatenate([parts[name] for name in self.names], axis=None)
         return changed
 
-    def _split(self, row: Array) -> Parts:
+    def _split(self, row: Array) -> ObservationParts:
         parts = self.layout.split(row.copy())
         return {name: values.reshape(self._shapes[name]) for name, values in parts.items()}
 
 
-def _find_observed(event: BoundEvent, first: Parts) -> list[str]:
+def _find_observed(event: BoundEvent, first: ObservationParts) -> list[str]:
     names = [event.event.of] if isinstance(event.event.of, str) else list(event.event.of)
     for name in names:
         check_name(name, first, f"events.{event.name}: no observation", event.error, listed="There is")

@@ -6,11 +6,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.task.events.event import Drawn, Parts, Range, Signal
+from rlctl.task.events.event import Drawn, ObservationParts, Range, Signal
 from rlctl.task.layout import Layout
+from rlctl.task.world_index import WorldIndex
 
 Array = NDArray[np.float64]
-Worlds = Any  # indices of worlds: an array of shape (k,), or a slice
 
 _BLOCK = 64
 """Number of steps whose random numbers are drawn together; a generator gives the same numbers one step at a time."""
@@ -25,7 +25,7 @@ class WorldSignal(Protocol):
     def begin(self, world: int, rng: np.random.Generator, first: Array, **values: Any) -> Drawn:
         """Begin the episode of a world, whose first values have the shape (size,); return the drawn values."""
 
-    def __call__(self, values: Array, worlds: Worlds) -> Array:
+    def __call__(self, values: Array, worlds: WorldIndex) -> Array:
         """Return the values of some worlds with noise or delay, shape (k, size)."""
 
 
@@ -38,7 +38,6 @@ class WorldNoise:
         self._rngs: dict[int, np.random.Generator] = {}
         self._numbers = np.zeros((worlds, self._block, size))
         self._next = np.zeros(worlds, np.int64)
-        self._worlds = np.arange(worlds)
 
     def begin(self, world: int, rng: np.random.Generator, first: Array, **values: Any) -> Drawn:
         """Draw the standard deviation of the episode from the range `std`."""
@@ -47,15 +46,14 @@ class WorldNoise:
         self._next[world] = self._block
         return {"std": float(self._std[world, 0])}
 
-    def __call__(self, values: Array, worlds: Worlds) -> Array:
+    def __call__(self, values: Array, worlds: WorldIndex) -> Array:
         """Add the numbers of the worlds' next step."""
-        indices = self._worlds[worlds]
-        for world in indices[self._next[indices] == self._block].tolist():
+        for world in worlds[self._next[worlds] == self._block].tolist():
             self._numbers[world] = self._rngs[world].standard_normal(self._numbers.shape[1:])
             self._next[world] = 0
-        numbers = self._numbers[indices, self._next[indices]]
-        self._next[indices] += 1
-        noisy: Array = values + self._std[indices] * numbers
+        numbers = self._numbers[worlds, self._next[worlds]]
+        self._next[worlds] += 1
+        noisy: Array = values + self._std[worlds] * numbers
         return noisy
 
 
@@ -65,7 +63,6 @@ class WorldDelay:
     def __init__(self, worlds: int, size: int, largest: Mapping[str, float]) -> None:
         self._past = np.zeros((int(largest["steps"]) + 1, worlds, size))
         self._steps, self._place = np.zeros(worlds, np.int64), np.zeros(worlds, np.int64)
-        self._worlds = np.arange(worlds)
 
     def begin(self, world: int, rng: np.random.Generator, first: Array, **values: Any) -> Drawn:
         """Draw the number of steps of the episode from the range `steps`; until then the first values are the past."""
@@ -74,13 +71,12 @@ class WorldDelay:
         self._past[:, world] = first
         return {"steps": float(self._steps[world])}
 
-    def __call__(self, values: Array, worlds: Worlds) -> Array:
+    def __call__(self, values: Array, worlds: WorldIndex) -> Array:
         """Return the values of earlier steps."""
-        indices = self._worlds[worlds]
-        place = (self._place[indices] + 1) % len(self._past)
-        self._place[indices] = place
-        self._past[place, indices] = values
-        late: Array = self._past[(place - self._steps[indices]) % len(self._past), indices]
+        place = (self._place[worlds] + 1) % len(self._past)
+        self._place[worlds] = place
+        self._past[place, worlds] = values
+        late: Array = self._past[(place - self._steps[worlds]) % len(self._past), worlds]
         return late
 
 
@@ -89,17 +85,18 @@ WORLD_SIGNALS: dict[Callable[..., Any], type[WorldSignal]] = {}
 
 
 def in_one_world(
-    signal: type[WorldSignal], rng: np.random.Generator, first: Parts, **ranges: Range
+    signal: type[WorldSignal], rng: np.random.Generator, first: ObservationParts, **ranges: Range
 ) -> tuple[Drawn, Signal]:
     """Start a signal for one world, as the function of an event does; authors may call it in functions of their own."""
     layout = Layout({name: int(np.size(value)) for name, value in first.items()})
+    world = np.zeros(1, np.int64)
     rows = signal(1, layout.size, {name: high for name, (_, high) in ranges.items()})
 
-    def join(parts: Parts) -> Array:
+    def join(parts: ObservationParts) -> Array:
         return np.concatenate([np.asarray(parts[name], np.float64) for name in first], axis=None)
 
-    def change(parts: Parts) -> Parts:
-        changed = layout.split(rows(join(parts)[None], slice(None))[0])
+    def change(parts: ObservationParts) -> ObservationParts:
+        changed = layout.split(rows(join(parts)[None], world)[0])
         return {name: values.reshape(np.shape(parts[name])) for name, values in changed.items()}
 
     drawn = rows.begin(0, rng, join(first), **ranges)

@@ -15,8 +15,9 @@ from rlctl.task.body import Contacts, MassState, Vector
 from rlctl.task.mujoco.inverse_kinematics import solve
 from rlctl.task.mujoco.motors import MujocoMotors
 from rlctl.task.mujoco.parts import Parts
-from rlctl.task.mujoco.world import Array, Rows
+from rlctl.task.mujoco.world import Array
 from rlctl.task.rotations import cross, rotate, rotate_inverse
+from rlctl.task.world_index import WorldIndex
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.owner import BodyOwner
@@ -267,7 +268,7 @@ class MujocoBody(MujocoMotors):
         *,
         velocity: Any = None,
         angular_velocity: Any = None,
-        worlds: Rows = None,
+        worlds: WorldIndex | None = None,
     ) -> None:
         rows: Any = ... if worlds is None else worlds
         turn = np.asarray(orientation, float)
@@ -302,7 +303,9 @@ class MujocoBody(MujocoMotors):
         speeds[..., start : start + 3] += velocity
         self._fields.touch()
 
-    def set_joints(self, positions: Array, velocities: Array | None = None, *, worlds: Rows = None) -> None:
+    def set_joints(
+        self, positions: Array, velocities: Array | None = None, *, worlds: WorldIndex | None = None
+    ) -> None:
         rows: Any = ... if worlds is None else worlds
         places, speeds = self._fields.data("qpos"), self._fields.data("qvel")
         shape = places[rows][..., self._positions].shape

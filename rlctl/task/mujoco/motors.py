@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rlctl.errors import TaskError, check_name
 from rlctl.task.body import Array, Body, Drives
-from rlctl.task.motors import Motor, Motors
+from rlctl.task.motors import AnyMotors, Motor
 from rlctl.task.mujoco.ideal_motors import IDEAL_DAMPING, IdealMotors
 from rlctl.task.mujoco.parts import Parts, find_slice
 from rlctl.task.mujoco.real_motors import (
@@ -32,7 +32,7 @@ from rlctl.task.mujoco.real_motors import (
     delay_of,
     list_history,
 )
-from rlctl.task.mujoco.world import Rows
+from rlctl.task.world_index import WorldIndex
 
 if TYPE_CHECKING:
     from rlctl.task.mujoco.owner import BodyOwner
@@ -103,7 +103,7 @@ class MujocoMotors(Body):
         sim.mujoco.mj_fullM(sim.model, sim.data, full)
         self.parts.inertia = np.diag(full)[self.parts.velocities].copy()
 
-    def forget_motors(self, worlds: Rows) -> None:
+    def forget_motors(self, worlds: WorldIndex | None) -> None:
         """Let nothing drive the joints after a reset, until the next command."""
         self.parts.active.clear()
 
@@ -127,7 +127,7 @@ class MujocoMotors(Body):
         self._write_armature(inertia)
         self._modes.clear()
 
-    def set_motors(self, motors: Motors, *, joints: Sequence[str] = (), **changes: Any) -> None:
+    def set_motors(self, motors: AnyMotors, *, joints: Sequence[str] = (), **changes: Any) -> None:
         chosen = self._spread_motors(motors, joints, changes)
         self._check_armature(chosen)
         self.parts.real |= chosen

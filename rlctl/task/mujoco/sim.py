@@ -26,8 +26,9 @@ from rlctl.task.mujoco.ideal_motors import make_ideal_motors
 from rlctl.task.mujoco.parts import WORLD, Parts
 from rlctl.task.mujoco.pictures import Marker, draw
 from rlctl.task.mujoco.scene import MujocoScene
-from rlctl.task.mujoco.world import Array, Fields, MujocoWorld, Rows
+from rlctl.task.mujoco.world import Array, Fields, MujocoWorld
 from rlctl.task.sim import Sim
+from rlctl.task.world_index import WorldIndex
 
 _LEAST_FRICTION = 1e-3
 """Of a contact: MuJoCo divides by it, and with less a falling robot's numbers become infinite."""
@@ -241,7 +242,7 @@ class MujocoSim(Sim):
             pairs[..., 3:] = np.maximum(rolling, self.mujoco.mjMINMU)[..., None]
         self.fields.touch()
 
-    def step(self, worlds: Rows = None) -> None:
+    def step(self, worlds: WorldIndex | None = None) -> None:
         if self._pushes:
             self._apply_pushes(None if worlds is None else set(worlds.tolist()))
         self.world.step(worlds)
@@ -270,7 +271,7 @@ class MujocoSim(Sim):
         self.world.save()
         self._look_up()
 
-    def restore(self, worlds: Rows = None) -> None:
+    def restore(self, worlds: WorldIndex | None = None) -> None:
         rows = None if worlds is None else set(worlds.tolist())
         self._pushes[:] = [push for push in self._pushes if rows is not None and push.world not in rows]
         self.world.restore(worlds)
@@ -351,7 +352,7 @@ class MujocoSim(Sim):
             add(scene)
         return scene
 
-    def take_pictures(self, camera: str, worlds: Rows = None) -> Pictures:
+    def take_pictures(self, camera: str, worlds: WorldIndex | None = None) -> Pictures:
         self.find_camera(camera)
         if not self._camera_pictures:
             self._camera_pictures.append(CameraPictures(self._make_drawn_scene(), self.cameras))
@@ -410,13 +411,13 @@ class OneWorldSim(MujocoSim):
         self.batch.load(*args, **kwargs)
         return self.bodies[args[0]]
 
-    def step(self, worlds: Rows = None) -> None:
+    def step(self, worlds: WorldIndex | None = None) -> None:
         self.batch.step(worlds)
 
     def save(self) -> None:
         self.batch.save()
 
-    def restore(self, worlds: Rows = None) -> None:
+    def restore(self, worlds: WorldIndex | None = None) -> None:
         self.batch.restore(worlds)
 
     def clear(self) -> None:

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from rlctl.errors import UsageError, WorldFailed
 from rlctl.library_output import print_mujoco_warnings
 from rlctl.task.mujoco.ideal_motors import IdealMotors
+from rlctl.task.world_index import WorldIndex
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64] | None
-"""Numbers of worlds; None: all."""
 
 _SERIOUS = {
     "mjWARN_BADQPOS": "positions are not finite or too large",
@@ -178,7 +177,7 @@ class MujocoWorld:
         except SimulationError as error:
             raise WorldFailed(f"MuJoCo: {self.batch.error(int(error.ids[0]))}", int(error.ids[0])) from None
 
-    def step(self, worlds: Rows = None) -> None:
+    def step(self, worlds: WorldIndex | None = None) -> None:
         """Take all substeps of a control step; afterwards everything but accelerations and forces is up to date."""
         if self.batch is not None:
             ids = None if worlds is None else np.sort(worlds).astype(np.int32)
@@ -268,7 +267,7 @@ class MujocoWorld:
             self._of_steps = {name: np.zeros_like(self.batch.bind(name)) for name in _OF_STEPS}
             self.touch()
 
-    def restore(self, worlds: Rows = None) -> None:
+    def restore(self, worlds: WorldIndex | None = None) -> None:
         """Restore the saved world, or some of the worlds, with the model as it was built; bit for bit."""
         rows: Any = slice(None) if worlds is None else worlds
         for name, values in self._built.items():
@@ -351,7 +350,7 @@ class Fields:
     def _select(self, array: Any) -> Any:
         return array if self.index is None else array[self.index]
 
-    def touch(self, worlds: Rows = None) -> None:
+    def touch(self, worlds: WorldIndex | None = None) -> None:
         """Note a change of the state or the model."""
         self.world.touch(self.index if worlds is None else worlds)
 

@@ -19,7 +19,7 @@ from rlctl.training.demonstrations import set_noise
 from rlctl.training.distilling.labelled_steps import LabelledSteps
 from rlctl.training.on_policy import OnPolicyRollouts
 from rlctl.training.progress import Progress
-from rlctl.training.rollouts import Check, WorkerVecEnv
+from rlctl.training.rollouts import SegmentWatch, WorkerVecEnv
 from rlctl.training.snapshot import Tensors
 
 TEACHER_SHARE = 0.2
@@ -60,9 +60,9 @@ class DistillingRollouts(OnPolicyRollouts):
     def _rng(self) -> np.random.Generator:
         return np.random.default_rng([self.model.seed, self.model.num_timesteps])
 
-    def finish(self, check: Check | None) -> None:
+    def finish(self, watch: SegmentWatch | None) -> None:
         """Wait for the segment and store it, with the teacher's actions in the place of those that were taken."""
-        super().finish(check)
+        super().finish(watch)
         segment, buffer = self.env.last_segment, self.model.rollout_buffer
         if not self._teaches or segment is None:
             return

@@ -37,7 +37,7 @@ class VectorAdam:
         self._bound: Any = None  # the state that is known to consist of parts of the vectors
 
     def step(self) -> None:
-        """Do what `step` does."""
+        """Do what the optimizer's own `step` does."""
         states = self._optimizer.state
         if self._bound is None or states[self._parameters[0]].get("exp_avg") is not self._bound:
             if not self._can_bind():

@@ -22,7 +22,7 @@ from rlctl.play.shared_arrays import ArrayLayout, map_arrays
 from rlctl.play.workers import available_cores
 from rlctl.printed_lines import print_line
 from rlctl.processes.child_process import ChildProcess, anonymous_file
-from rlctl.training.updates.perceptrons import Floats, Shapes, count_floats
+from rlctl.training.updates.perceptrons import ArrayShapes, Floats, count_floats
 
 MAX_BLOCKS = 8
 OFF_POLICY_BLOCKS = 4  # their minibatches are small, and all blocks' gradients of their large critics are added
@@ -49,7 +49,7 @@ def select_block(block: int, count: int, first: int, size: int) -> slice:
 class BlockSettings(Protocol):
     """Plain data that describes the networks and the arrays of an update."""
 
-    def list_shapes(self) -> Shapes:
+    def list_shapes(self) -> ArrayShapes:
         """Return the shapes of all trained parameters."""
 
     def make_layout(self) -> ArrayLayout:

@@ -14,26 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
-Shapes = list[tuple[int, ...]]
+ArrayShapes = list[tuple[int, ...]]
 
 LOG_SQRT_TAU = 0.5 * math.log(2 * math.pi)  # minus the logarithm of the standard normal density at 0
 _ALIGNMENT = 16  # [floats], a cache line
 
 
-def list_shapes(sizes: Sequence[int], networks: int = 1) -> Shapes:
+def list_shapes(sizes: Sequence[int], networks: int = 1) -> ArrayShapes:
     """Return the shapes of weight and bias per layer; `sizes`: of the inputs, and of the outputs of each layer."""
-    shapes: Shapes = []
+    shapes: ArrayShapes = []
     for inputs, outputs in itertools.pairwise(sizes):
         shapes += [(networks, outputs, inputs), (networks, 1, outputs)]
     return shapes
 
 
-def count_floats(shapes: Shapes) -> int:
+def count_floats(shapes: ArrayShapes) -> int:
     """Return the length of the vector that `split_vector` needs."""
     return sum(-(-math.prod(shape) // _ALIGNMENT) * _ALIGNMENT for shape in shapes)
 
 
-def split_vector(vector: Floats, shapes: Shapes) -> list[Floats]:
+def split_vector(vector: Floats, shapes: ArrayShapes) -> list[Floats]:
     """Return parts of a vector as arrays of the given shapes, which share its memory."""
     parts, first = [], 0
     for shape in shapes:

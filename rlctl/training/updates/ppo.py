@@ -106,7 +106,9 @@ class PpoUpdate:
             order = np.random.permutation(len(advantages))  # noqa: NPY002
             self._arrays["order"][:], self._arrays["advantages"][:] = order, advantages[order]
             starts = range(0, len(order), model.batch_size)
-            finished = all(self._update(first, min(model.batch_size, len(order) - first), logged) for first in starts)
+            sizes = (min(model.batch_size, len(order) - first) for first in starts)
+            minibatches = zip(starts, sizes, strict=True)
+            finished = all(self._learn_minibatch(first, size, logged) for first, size in minibatches)
             model._n_updates += 1
             if not finished:
                 break
@@ -123,7 +125,7 @@ class PpoUpdate:
         advantages: NDArray[Any] = buffer.swap_and_flatten(buffer.advantages).ravel()
         return advantages
 
-    def _update(self, first: int, size: int, logged: dict[str, list[float]]) -> bool:
+    def _learn_minibatch(self, first: int, size: int, logged: dict[str, list[float]]) -> bool:
         """Learn from a minibatch; return False without an update if the policy has moved beyond `target_kl`."""
         model, count = self._model, self._count_blocks(size)
         if model.normalize_advantage and size > 1:

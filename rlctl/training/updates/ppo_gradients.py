@@ -10,7 +10,7 @@ import numpy as np
 from rlctl.play.shared_arrays import ArrayLayout
 from rlctl.task.mirror import Mirror
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
-from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, Floats, MlpStack, Shapes, list_shapes, split_vector
+from rlctl.training.updates.perceptrons import LOG_SQRT_TAU, ArrayShapes, Floats, MlpStack, list_shapes, split_vector
 
 DIFFERENTIATE, EVALUATE = 0, 1  # phases
 LOSSES = ("policy_gradient_loss", "entropy_loss", "clip_fraction", "approx_kl", "value_loss", "mirror_loss")
@@ -34,7 +34,7 @@ class PpoSettings:
     mirror_images: bool = True  # whether they are learned from as if they had been played
     mirror_loss: float = 0.0  # weight
 
-    def list_shapes(self) -> Shapes:
+    def list_shapes(self) -> ArrayShapes:
         """Return the shapes of the parameters: of the actor, of the critic, of the deviation."""
         return [*list_shapes(self.actor), *list_shapes(self.critic), self.log_std]
 

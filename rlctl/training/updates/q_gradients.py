@@ -7,7 +7,7 @@ import numpy as np
 
 from rlctl.play.shared_arrays import ArrayLayout
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
-from rlctl.training.updates.perceptrons import Floats, MlpStack, Shapes, count_floats, list_shapes, split_vector
+from rlctl.training.updates.perceptrons import ArrayShapes, Floats, MlpStack, count_floats, list_shapes, split_vector
 
 CRITICS, ACTOR = 0, 1  # phases; DQN has only the first
 
@@ -25,11 +25,11 @@ class QSettings:
     actor: tuple[int, ...] = ()
     actor_uses_tanh: bool = False
 
-    def list_critic_shapes(self) -> Shapes:
+    def list_critic_shapes(self) -> ArrayShapes:
         """Return the shapes of the critics' parameters, which come first."""
         return list_shapes(self.critic, self.critics)
 
-    def list_shapes(self) -> Shapes:
+    def list_shapes(self) -> ArrayShapes:
         """Return the shapes of all trained parameters."""
         return [*self.list_critic_shapes(), *list_shapes(self.actor)]
 

@@ -91,13 +91,14 @@ class DqnUpdate:
         """Do `gradient_steps` updates with minibatches of the replay buffer; log what SB3 logs."""
         model = self._model
         model._update_learning_rate(model.policy.optimizer)
-        losses = [self._update(batch) for batch in sample_batches(model, model.q_net, gradient_steps, batch_size)]
+        batches = sample_batches(model, model.q_net, gradient_steps, batch_size)
+        losses = [self._learn_minibatch(batch) for batch in batches]
         model._n_updates += gradient_steps
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
         model.logger.record("train/loss", np.mean(losses))
 
-    def _update(self, batch: Batch) -> float:
-        """Return the loss before the update."""
+    def _learn_minibatch(self, batch: Batch) -> float:
+        """Learn from a minibatch; return the loss before."""
         self._networks.read(batch)
         gradient, loss = self._networks.differentiate(CRITICS)
         clip_norm(gradient, self._model.max_grad_norm)

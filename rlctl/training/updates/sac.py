@@ -124,7 +124,7 @@ class SacUpdate:
         following = torch.from_numpy(self._arrays["targets"])
         for step, batch in enumerate(sample_batches(model, model.critic, gradient_steps, batch_size)):
             learns_actor = (model._n_updates + step + self.first_update) % self._policy_delay == 0
-            self._update(batch, logged, learns_actor=learns_actor, with_loss=step % _LOSS_EVERY == 0)
+            self._learn_minibatch(batch, logged, learns_actor=learns_actor, with_loss=step % _LOSS_EVERY == 0)
             if self.has_targets and step % model.target_update_interval == 0:
                 following.lerp_(followed, model.tau)
         model._n_updates += gradient_steps
@@ -132,7 +132,9 @@ class SacUpdate:
             model.logger.record(f"train/{name}", np.mean(values))
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
-    def _update(self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool) -> None:
+    def _learn_minibatch(
+        self, batch: Batch, logged: dict[str, list[float]], *, learns_actor: bool, with_loss: bool
+    ) -> None:
         coefficient, arrays = self._read_coefficient(), self._arrays
         arrays["numbers"][:2] = coefficient, with_loss
         for name in ("features", "next_features", "actions", "rewards", "discounts"):

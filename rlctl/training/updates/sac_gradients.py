@@ -10,7 +10,7 @@ import numpy as np
 
 from rlctl.play.shared_arrays import ArrayLayout
 from rlctl.training.updates.blocks import MAX_BLOCKS, Arrays, BlockWork, select_block
-from rlctl.training.updates.perceptrons import Floats, MlpStack, Shapes, count_floats, list_shapes, split_vector
+from rlctl.training.updates.perceptrons import ArrayShapes, Floats, MlpStack, count_floats, list_shapes, split_vector
 from rlctl.training.updates.squashed_gaussian import SquashedGaussian
 
 CRITICS, ACTOR = 0, 1  # phases
@@ -33,15 +33,15 @@ class SacSettings:
     mean_limit: float | None
     dropped: int = 0  # TQC: of all critics' quantiles
 
-    def list_critic_shapes(self) -> Shapes:
+    def list_critic_shapes(self) -> ArrayShapes:
         """Return the shapes of the critics' parameters, which come first."""
         return list_shapes(self.critic, self.critics)
 
-    def list_actor_shapes(self) -> Shapes:
+    def list_actor_shapes(self) -> ArrayShapes:
         """Return the shapes of the actor's parameters; with gSDE `log_std` is the last."""
         return list_shapes(self.actor) + ([] if self.log_std is None else [self.log_std])
 
-    def list_shapes(self) -> Shapes:
+    def list_shapes(self) -> ArrayShapes:
         """Return the shapes of all trained parameters."""
         return [*self.list_critic_shapes(), *self.list_actor_shapes()]
 

@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 
 from rlctl.storage import files
-from rlctl.training.checkpoint_file import ReplaySegments
+from rlctl.training.checkpoint_file import ReplayParts
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
@@ -20,16 +20,16 @@ def fill(buffer, steps):
 
 def test_what_is_removed_while_training_is_written_again(tmp_path):
     buffer = ReplayBuffer(50, BOX, BOX, device="cpu")
-    segments = ReplaySegments(tmp_path / "replay", buffer)
-    segments.folder.mkdir()
+    parts = ReplayParts(tmp_path / "replay", buffer)
+    parts.folder.mkdir()
     fill(buffer, 20)
-    segments.save(20)
-    shutil.rmtree(segments.folder)
-    segments.folder.mkdir()
+    parts.save(20)
+    shutil.rmtree(parts.folder)
+    parts.folder.mkdir()
     fill(buffer, 5)
-    named = segments.save(25)
-    for segment in named:
-        files.check_digest(segments.folder / segment.name, segment.sha256)
-    read = ReplaySegments(segments.folder, ReplayBuffer(50, BOX, BOX, device="cpu"))
+    named = parts.save(25)
+    for part in named:
+        files.check_digest(parts.folder / part.name, part.sha256)
+    read = ReplayParts(parts.folder, ReplayBuffer(50, BOX, BOX, device="cpu"))
     read.load(named, 25)
     np.testing.assert_array_equal(read.buffer.observations[:25], buffer.observations[:25])
