@@ -153,7 +153,9 @@ MAY_SHARE_A_NAME = {
     "rlctl/checking/experiments/goals.py: Source",
     "rlctl/checking/experiments/held.py: Rows",
     "rlctl/checking/kept_state.py: Observed",
+    "rlctl/checking/rules/rl614_hindsight_reward_differs.py: Rows",
     "rlctl/checking/rules/rl816_command_beyond_ctrlrange.py: BulletJoint",
+    "rlctl/environments/bullet_calls.py: Contacts",  # as PyBullet returns them
 }
 
 
