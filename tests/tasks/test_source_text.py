@@ -109,7 +109,7 @@ CODE |= dict.fromkeys(
         *("armature", "gear_damping", "swing", "least_swing", "speed_scale", "turn_scale", "push", "bounce_weight"),
         *("sway_weight", "height_weight", "steps_up"),
         *("half", "width", "held", "scale", "lifted", "nearest", "noise", "released", "sag", "least_down"),
-        *("size", "substeps", "farthest"),
+        *("size", "substeps", "farthest", "friction", "iterations"),
     ),
     "1",
 )
