@@ -8,6 +8,7 @@ from mujoco_robots import MujocoArm
 
 
 class EndsIncome:
+    rlctl_ignore = {"RL610": "random actions reach its goals, so that there are successes to compare"}
     bonus = 1.0
 
     def step(self, action):

@@ -76,7 +76,8 @@ class TurnsBack:
         return np.array([cosine * x - sine * y, cosine * y + sine * x])
 
 
-class FlyerSeeks(Seeks, Flyer): ...
+class FlyerSeeks(Seeks, Flyer):
+    rlctl_ignore = {"RL110": "its height does not change"}
 
 
 class RL125FlyerTurnsBack(TurnsBack, FlyerSeeks): ...
