@@ -8,6 +8,7 @@ from importlib import import_module
 
 import pytest
 
+from rlctl.checking import rules
 from rlctl.checking.rules import EXPERIMENTS, PROCESSES, RULES, find_needs
 from rlctl.checking.values import find_numbers
 from tests.checking.judging import (
@@ -107,6 +108,11 @@ CASES = [
         slow=True,
     ),
 ]
+
+
+def test_a_second_judge_of_a_rule_is_no_silent_replacement():
+    with pytest.raises(ValueError, match=r"^RL104: two of str; one is enough$"):
+        rules._index([("RL103", "a"), ("RL104", "a"), ("RL104", "b")])
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)

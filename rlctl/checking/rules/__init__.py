@@ -1,10 +1,10 @@
 '''The rules of check-env, a file each: text, severity, the code that judges it, and what that needs.
 
-To add a rule, write `rl1xx_what_is_wrong.py` here, whose name begins with the id. Nothing else lists it.
+To add a rule, write `rl1xx_what_is_wrong.py` here, whose name begins with the id. No list has to name it.
 
     RULE = Rule("RL1xx", "what is wrong", Severity.WARNING, meaning="""...""", fix="""...""")
 
-Its code is one of these, or several:
+Its code is one of these, or several, but of each decorator one at most:
 
     @judges_records(RULE, "episodes")       # in the parent, from what experiments recorded; by default RECORDING
     def find_both_flags(records: Records) -> Iterator[RuleFinding]:
@@ -28,13 +28,16 @@ then the rule's page: `python docs/make_rules.py --run RL1xx`.
 
 import importlib
 import pkgutil
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from types import ModuleType
+from typing import TypeVar
 
 from rlctl.checking import experiments
 from rlctl.checking.experiment import HASH_SEEDS, Experiment, RecordsJudge
 from rlctl.checking.rule import Rule
 from rlctl.errors import UsageError, did_you_mean
+
+Value = TypeVar("Value")
 
 PROCESS_S = 18.0  # for the experiments of one process [s], besides importing and building
 MOST_GROWTH = 5.0  # times longer, for an environment whose steps are slow
@@ -59,19 +62,28 @@ def _import_modules(package: str, path: Sequence[str]) -> list[ModuleType]:
     return [importlib.import_module(f"{package}.{module.name}") for module in pkgutil.iter_modules(path)]
 
 
+def _index(pairs: Iterable[tuple[str, Value]]) -> dict[str, Value]:
+    """Return a dictionary; raises `ValueError` for what would be in it twice."""
+    found: dict[str, Value] = {}
+    for name, value in pairs:
+        if found.setdefault(name, value) is not value:
+            raise ValueError(f"{name}: two of {type(value).__name__}; one is enough")
+    return found
+
+
 _RULE_MODULES = _import_modules(__name__, __path__)
 _MODULES = [
     *_RULE_MODULES,
     *_import_modules(experiments.__name__, experiments.__path__),
 ]
 _MEMBERS = [value for module in _MODULES for value in vars(module).values()]
-_EXPERIMENTS = {value.name: value for value in _MEMBERS if isinstance(value, Experiment)}
+_EXPERIMENTS = _index((value.name, value) for value in _MEMBERS if isinstance(value, Experiment))
 
 _RULES: list[Rule] = [module.RULE for module in _RULE_MODULES]
 RULES = {rule.id: rule for rule in sorted(_RULES, key=lambda rule: rule.id)}
-JUDGES = {value.rule: value for value in _MEMBERS if isinstance(value, RecordsJudge)}
+JUDGES = _index((value.rule, value) for value in _MEMBERS if isinstance(value, RecordsJudge))
 EXPERIMENTS = {one.name: one for one in sorted(_EXPERIMENTS.values(), key=lambda one: one.place)}
-DECIDED_BY = {rule: one for one in EXPERIMENTS.values() for rule in one.rules}
+DECIDED_BY = _index((rule, one) for one in EXPERIMENTS.values() for rule in one.rules)
 PROCESSES = {
     process: tuple(one.name for one in EXPERIMENTS.values() if one.process == process) for process in HASH_SEEDS
 }
