@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -37,11 +37,9 @@ class EngineValues:
     def read(cls, logs: Sequence[WorldLog]) -> "EngineValues":
         """Read logs of one world: joints, angles of free bodies, and places and velocities of links, in the world and
         in their own frame. Empty where it has not the same bodies in all of them."""
-        if (
-            len({tuple(part.shape for part in (*states, rows)) for log in logs for states, rows in _list_looks(log)})
-            != 1
-        ):
-            return cls([], np.zeros((sum(len(log.states) for log in logs), 0)))
+        looks = [(*states, rows) for log in logs for states, rows in zip(log.states, log.points, strict=True)]
+        if len({tuple(part.shape for part in look) for look in looks}) != 1:
+            return cls([], np.zeros((len(looks), 0)))
         names: list[EngineValue] = []
         columns: list[Array] = []
 
@@ -78,12 +76,7 @@ class EngineValues:
                 add(what, vectors, is_angle=is_angle, is_speed=True)
                 inside = attitudes.rotate(rows[:, TURN], vectors)[:, :3]
                 add(f"{what} in its own frame", inside, is_angle=is_angle, is_speed=True)
-        count = sum(len(log.states) for log in logs)
-        return cls(names, np.nan_to_num(np.hstack([np.zeros((count, 0)), *columns])))
-
-
-def _list_looks(log: WorldLog) -> Iterator[tuple[list[Array], Array]]:
-    yield from zip(log.states, log.points, strict=True)
+        return cls(names, np.nan_to_num(np.hstack([np.zeros((len(looks), 0)), *columns])))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -85,7 +85,8 @@ def export(
 
         policy_file.show(policy_file.export_actor(request), json)
         return
-    from rlctl.exporting.export import export_policy, show
+    from rlctl.exporting.export import export_policy
+    from rlctl.exporting.report import show
 
     if controller:
         from rlctl.exporting.controller.export import export_controller

@@ -15,7 +15,6 @@ from rlctl.errors import TaskError, UsageError
 from rlctl.exporting.export_request import ExportRequest
 from rlctl.exporting.exported_policy import check_environment, explain_unverifiable, find_source
 from rlctl.exporting.report import ExportReport, check_verified, describe_policy
-from rlctl.exporting.report import show as show  # the command takes both from here
 from rlctl.exporting.verify import EPISODES, measure_latency, verify
 from rlctl.hub import store
 from rlctl.play.workers import Workers, count_envs
