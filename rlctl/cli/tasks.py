@@ -202,7 +202,8 @@ def new_task(
         str | None, Option("Play of the gears of --motors, from end to end: 1deg or 0.02rad.", metavar="ANGLE")
     ] = None,
     motion: Annotated[
-        list[str], Option("A clip for --model to follow, .csv or .npz; again for further ones.", metavar="FILE")
+        list[str],
+        Option("A clip for --model to follow, or to walk like with --walk; again for further ones.", metavar="FILE"),
     ] = [],
     rate: Annotated[
         float | None, Option("Frames per second of --motion, if they are not in the file.", min=1, metavar="HZ")
@@ -211,7 +212,10 @@ def new_task(
         str | None, Option("Order of the root's quaternion in --motion: xyzw or wxyz.", metavar="ORDER")
     ] = None,
     clip_joints: Annotated[
-        str | None, Option("Joints of the columns of --motion, in their order; - for none.", metavar="NAMES")
+        str | None,
+        Option(
+            "Joints of the columns of --motion, in their order; - for none, -NAME for the other sign.", metavar="NAMES"
+        ),
     ] = None,
     frames: Annotated[
         str | None, Option("Frames of --motion that are taken, such as 120:480.", metavar="FIRST:LAST")

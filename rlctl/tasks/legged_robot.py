@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rlctl.errors import TaskError, UsageError
+from rlctl.task.clip_options import ClipOptions
+from rlctl.task.motion import MotionClip
 from rlctl.task.mujoco.robot import read_keyframe
 from rlctl.task.rotations import rotate_inverse
 from rlctl.tasks.asked_motors import AskedMotors
+from rlctl.tasks.clips import list_files, read_clips, write_clips
 from rlctl.tasks.gait import Gait, describe_gait
 from rlctl.tasks.legs import Leg, Skeleton, find_legs, find_wheels
 from rlctl.tasks.model_copy import copy_model, find_own_model, remove_floor
@@ -50,6 +53,7 @@ class _Legged:
     height: float  # of the trunk's centre of mass above the ground when it stands [m]
     gait: Gait
     motors: AskedMotors | None
+    clips: Sequence[MotionClip]  # whose style it walks in; empty for its own
 
     @property
     def guesses(self) -> dict[str, float]:
@@ -78,8 +82,15 @@ class _Legged:
         return [leg.foot.link for leg in self.legs]
 
 
-def read_legged_robot(model: str, motors: AskedMotors | None = None) -> StarterRobot:
+def read_legged_robot(
+    model: str,
+    motors: AskedMotors | None = None,
+    motions: Sequence[str] = (),
+    options: ClipOptions = ClipOptions(),  # noqa: B008 (it cannot change)
+) -> StarterRobot:
     """Read a user's URDF or MJCF file of a robot with legs, which is free to move, with real `motors` or springs.
+
+    It walks in the style of the clips `motions`, if there are any.
 
     Raises `UsageError` for a file that is missing, cannot be loaded, has no joints, a fixed base or no legs.
     """
@@ -101,11 +112,12 @@ def read_legged_robot(model: str, motors: AskedMotors | None = None) -> StarterR
     keyframe, stance = _find_keyframe(skeleton, legs, search.longest)
     stance = stance or search.find()
     gait = describe_gait(skeleton, legs, stance, mirror)
-    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height, gait, motors)
+    clips, found = read_clips(body, motions, options)
+    legged = _Legged(body, path, legs, stance, keyframe, 0, stance.height, gait, motors, clips)
     steps_up, height = _stand(legged)
     legged = dataclasses.replace(legged, steps_up=steps_up, height=height)
-    files = copy_model(path)
-    notes = [*_list_notes(legged), *remove_floor(files, Path(path.name))]
+    files = copy_model(path) | write_clips(clips)
+    notes = [*found, *_list_notes(legged), *remove_floor(files, Path(path.name))]
     return StarterRobot(
         _describe(legged), files, _summarize(legged, notes), template=TEMPLATE, kept=_choose_lines(legged)
     )
@@ -121,6 +133,8 @@ def _choose_lines(legged: _Legged) -> frozenset[str]:
         "drives": legged.motors is None,
         "mirror": bool(legged.gait.other_side),
         f"mirror_{kind}": bool(legged.gait.other_side),
+        "style": bool(legged.clips),
+        f"style_{kind}": bool(legged.clips),
     }
     return frozenset(name for name, is_kept in chosen.items() if is_kept)
 
@@ -278,6 +292,8 @@ def _judge_densities(body: MujocoBody) -> list[str]:
 
 def _summarize(legged: _Legged, notes: Sequence[str]) -> str:
     start = f"keyframe {legged.keyframe!r}" if legged.keyframe else "a search"
+    if legged.clips:
+        start += f"; walks in the style of {', '.join(clip.name for clip in legged.clips)}"
     first = (
         f"{legged.path.name}: {legged.body.total_mass():.3g} kg on {len(legged.legs)} legs, "
         f"{', '.join(legged.feet)}; {legged.stance.leg_length:.2g} m from hip to foot in STANCE, which is from {start}"
@@ -348,6 +364,8 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
         "mirror_vector": vector,
         "mirror_turn": turn,
         "mirror_command": command,
+        "clips": list_files(legged.clips),
+        "both_sides": SourceText(", OTHER_SIDE" if gait.other_side else ""),
         "period": write_number(numbers.period, "g"),
         "swing": write_number(numbers.swing, "g"),
         "least_swing": write_number(numbers.swing / 7, ".2g"),

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from rlctl.errors import UsageError
 from rlctl.task.clip_options import ClipOptions
-from rlctl.task.motion import MotionClip, write_motion
-from rlctl.task.motion_files import RobotJoints, read_clip
+from rlctl.task.motion import MotionClip
+from rlctl.tasks.clips import list_files, read_clips, write_clips
 from rlctl.tasks.legged_robot import load_free
 from rlctl.tasks.model_copy import copy_model, remove_floor, remove_sensors
-from rlctl.tasks.motion_faults import Heights, find_faults, find_shift, measure_heights
 from rlctl.tasks.scaling import GRAVITY
 from rlctl.tasks.source_text import SourceText, join_source, write_list, write_number, write_string
 from rlctl.tasks.starter_robot import StarterRobot, list_faults, name_robot
@@ -78,15 +77,7 @@ def read_motion_robot(model: str, motions: Sequence[str], options: ClipOptions) 
     Raises `UsageError` for a file that is missing or cannot be loaded, a fixed base, and a clip that does not fit.
     """
     path, body = _load(model)
-    joints = _describe_joints(body)
-    read = [read_clip(motion, joints, options) for motion in motions]
-    notes = [note for _, found in read for note in found]
-    clips: list[MotionClip] = []
-    for clip, _ in read:
-        standing, found = _put_on_floor(body, clip)
-        clips.append(standing)
-        notes += found
-    clips = _name_clips(clips)
+    clips, notes = read_clips(body, motions, options)
     size = float(np.median(np.concatenate([clip.root_position[:, 2] for clip in clips])))
     if size <= 0:
         raise UsageError(f"--motion: the root is {size:.3g} m above the ground on average; z must be upwards, in m")
@@ -98,25 +89,12 @@ def read_motion_robot(model: str, motions: Sequence[str], options: ClipOptions) 
     files = copy_model(path)
     notes += remove_floor(files, Path(path.name))
     notes += remove_sensors(files, Path(path.name))
-    files |= {Path(f"{clip.name}.csv"): write_motion(clip) for clip in clips}
+    files |= write_clips(clips)
     kept = {"many" if len(clips) > 1 else "one"}
     if follower.loses_friction:
         kept.add("friction")
     summary = _summarize(follower, notes)
     return StarterRobot(_describe(follower), files, summary, template=TEMPLATE, kept=frozenset(kept))
-
-
-def _put_on_floor(body: MujocoBody, clip: MotionClip) -> tuple[MotionClip, list[str]]:
-    """Return the clip at the height at which the robot stands on the floor, and what was found in it."""
-    heights, notes = measure_heights(body, clip), []
-    shift = find_shift(heights)
-    if shift:
-        how = "raised" if shift > 0 else "lowered"
-        notes.append(f"{clip.name}: {how} by {100 * abs(shift):.1f} cm to the floor")
-    moved = dataclasses.replace(clip, root_position=clip.root_position + np.array([0.0, 0.0, shift]))
-    faults = find_faults(body, moved, Heights(heights.lowest + shift, heights.centre + shift))
-    notes += [f"finding: {fault}" for fault in faults] or [f"{clip.name}: no findings"]
-    return moved, notes
 
 
 def _load(model: str) -> tuple[Path, MujocoBody]:
@@ -133,33 +111,6 @@ def _load(model: str) -> tuple[Path, MujocoBody]:
     if sliding:
         raise UsageError(f"--model {model}: joint {sliding[0]!r} slides; --motion needs joints that rotate")
     return path, body
-
-
-def _describe_joints(body: MujocoBody) -> RobotJoints:
-    model, names = body._sim.model, body.joint_names
-    depths = []
-    for joint in body.parts.joints:
-        link, depth = int(model.jnt_bodyid[joint]), 0
-        while link:
-            link, depth = int(model.body_parentid[link]), depth + 1
-        depths.append(depth)
-    order = sorted(range(len(names)), key=lambda index: depths[index])  # a stable sort
-    low, high = body.joint_low, body.joint_high
-    rest = np.clip(0.0, low, high)
-    return RobotJoints(body.file.name, names, [names[index] for index in order], low, high, rest)
-
-
-def _name_clips(clips: list[MotionClip]) -> list[MotionClip]:
-    """Return clips with names of files that differ."""
-    named: list[MotionClip] = []
-    for clip in clips:
-        plain = "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in clip.name) or "clip"
-        name, number = plain, 1
-        while any(other.name == name for other in named):
-            number += 1
-            name = f"{plain}-{number}"
-        named.append(dataclasses.replace(clip, name=name))
-    return named
 
 
 def _find_forces(body: MujocoBody, clip: MotionClip, size: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -242,7 +193,7 @@ def _describe(follower: _Follower) -> dict[str, str]:
         "robot_phrase": name,
         "model": follower.path.name,
         "joints": write_list("JOINTS = ", map(write_string, body.joint_names)),
-        "clips": write_list("CLIPS = ", [write_string(f"{clip.name}.csv") for clip in follower.clips]),
+        "clips": list_files(follower.clips),
         "links": write_list("LINKS = ", map(write_string, follower.links)),
         "size": write_number(size, ".3f"),
         "max_force": write_list("MAX_FORCE = np.array(", map(write_number, follower.forces), ")"),

@@ -63,22 +63,31 @@ class AskedRobot:
     """The link whose origin is between the fingers of a hand."""
     motors: AskedMotors | None = None
     motions: tuple[str, ...] = ()
-    """Clips that it follows."""
+    """Clips that it follows, or in whose style it walks."""
     clip: ClipOptions = ClipOptions()  # noqa: RUF009 (it cannot change)
     """What a user says of the clips."""
 
+    @property
+    def follows(self) -> bool:
+        """Whether it follows clips; a robot that walks only moves like them."""
+        return bool(self.motions) and not self.walk
+
     def check(self) -> None:
         """Raise `UsageError` for options that exclude each other, or need another one."""
-        kinds = [*(["walk"] if self.walk else []), *self.hand, *(["motion"] if self.motions else [])]
+        kinds = [*(["walk"] if self.walk else []), *self.hand, *(["motion"] if self.follows else [])]
         if len(kinds) > 1:
             raise UsageError(f"{' and '.join(f'--{kind}' for kind in kinds)} exclude each other: a task has one aim")
         chosen = {"link": self.link, "gripper": self.gripper, "tip": self.tip, "motors": self.motors}
-        given = [*kinds, *(name for name, value in chosen.items() if value is not None)]
+        given = [
+            *kinds,
+            *(["motion"] if self.motions else []),
+            *(name for name, value in chosen.items() if value is not None),
+        ]
         if self.model is None and given:
             raise UsageError(f"--{given[0]} needs --model")
         if kinds and self.link is not None:
             raise UsageError(f"--{kinds[0]} and --link exclude each other: --link is the tip of an arm that reaches")
-        if self.motions and self.motors is not None:
+        if self.follows and self.motors is not None:
             raise UsageError("--motors and --motion exclude each other: call set_motors in the task's build instead")
         if not self.motions and self.clip != ClipOptions():
             raise UsageError("--rate, --quaternion, --clip-joints and --frames need --motion")
@@ -132,7 +141,7 @@ def create(
         for path, data in content.items():
             (temporary / path).parent.mkdir(parents=True, exist_ok=True)
             storage_files.write_new(temporary / path, data)
-    return NewPlugin(name, folder, package, cls, sorted(content), robot.summary, follows=bool(asked.motions))
+    return NewPlugin(name, folder, package, cls, sorted(content), robot.summary, follows=asked.follows)
 
 
 def _read_robot(asked: AskedRobot) -> StarterRobot:
@@ -141,7 +150,7 @@ def _read_robot(asked: AskedRobot) -> StarterRobot:
     if asked.walk:
         from rlctl.tasks.legged_robot import read_legged_robot  # it loads NumPy
 
-        return read_legged_robot(asked.model, asked.motors)
+        return read_legged_robot(asked.model, asked.motors, asked.motions, asked.clip)
     if asked.motions:
         from rlctl.tasks.motion_robot import read_motion_robot
 

@@ -1,5 +1,7 @@
 """Clips of other programs: orders that are found, rates, and what is refused in one line."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,46 @@ def test_columns_by_the_names_that_a_user_gives(tmp_path):
     assert motion.joint_positions[0] == pytest.approx([0.5, 0.0, -1.0, -0.2])
 
 
+def test_joints_that_turn_the_other_way(tmp_path):
+    file = write(tmp_path, make_rows(pose=POSE * [1, 1, -1, 1]))
+    _, notes = read(file)
+    assert notes[1] == (
+        "finding: clip_30hz.csv: beyond the limits, and within them with the other sign: left_elbow; give -left_elbow "
+        "for left_elbow in --clip-joints"
+    )
+    motion, notes = read(file, joints=(*NAMES[:2], f"-{NAMES[2]}", NAMES[3]))
+    assert motion.joint_positions[0] == pytest.approx(POSE)
+    assert len(notes) == 1
+
+
+def write_json(folder, content) -> str:
+    (folder / "clip.txt").write_text(json.dumps(content))
+    return str(folder / "clip.txt")
+
+
+def test_json_frames(tmp_path):
+    frames = make_rows().tolist()
+    motion, (note, *_) = read(write_json(tmp_path, {"LoopMode": "Wrap", "FrameDuration": 0.01667, "Frames": frames}))
+    assert motion.rate == pytest.approx(59.988)
+    assert motion.joint_positions[0] == pytest.approx(POSE)
+    assert "(its FrameDuration)" in note
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        ({"frames": []}, "JSON with frames; expected Frames, a list of rows of numbers"),
+        ({"Frames": []}, "JSON with Frames; expected"),
+        ({"Frames": [[0.0] * 11, [0.0] * 10]}, "frame 1 is not a row of 11 numbers"),
+        ({"Frames": [[0.0] * 11, [None] * 11]}, "frame 1 is not a row of 11 numbers"),
+        ({"Frames": [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *POSE]] * 2}, "2 frames; a clip has at least 3"),
+    ],
+)
+def test_json_that_is_no_clip(tmp_path, content, problem):
+    with pytest.raises(UsageError, match=problem):
+        read(write_json(tmp_path, content))
+
+
 def test_a_time_before_columns_without_names(tmp_path):
     rows = np.column_stack([np.arange(4) / 60, make_rows()])
     motion, (note, *_) = read(write(tmp_path, rows, "clip.csv"))
@@ -119,7 +161,7 @@ def test_an_npz_that_is_a_pickle_is_refused(tmp_path):
     [
         ("walk.bvh", "retarget it first, with GMR"),
         ("walk.pkl", "is a pickle"),
-        ("walk.mp4", "give a .csv or an .npz file"),
+        ("walk.mp4", "give a .csv, .npz, or .json or .txt file"),
         ("walk.csv", "no file"),
     ],
 )

@@ -10,6 +10,7 @@ from rlctl.environments.info import describe
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError
 from rlctl.task.clip_options import ClipOptions
+from rlctl.task.motion import read_motion
 from rlctl.task.worlds import TaskWorlds
 from rlctl.tasks import new
 from tests.tasks.test_motion_faults import BENT
@@ -78,6 +79,26 @@ def test_two_clips_and_a_command_that_chooses(folder):
         assert task.rows == starts
 
 
+def test_a_robot_that_walks_in_the_style_of_a_clip(folder):
+    plugin = new.create("dog-minds", model="dog.xml", walk=True, motions=["bend_30hz.csv"])
+    assert "walks in the style of bend_30hz" in plugin.summary
+    assert "bend_30hz: no findings" in plugin.summary
+    assert not plugin.follows
+    with contextlib.closing(EnvSpec(plugin.target).make()) as env:
+        task = env.unwrapped.task
+        env.reset(seed=0)
+        env.step(env.action_space.sample() * 0)
+        rows = read_motion(folder / "dog-minds" / "dog_minds" / "bend_30hz.csv").take_joints(task.body.joint_names)
+        task.body.set_joints(rows[:1], worlds=np.zeros(1, np.int64))
+        near = task.rewards(np.zeros((1, 12)))
+        task.body.set_joints(rows[:1] + 0.4, worlds=np.zeros(1, np.int64))
+        far = task.rewards(np.zeros((1, 12)))
+    # The clip is at rest in its first row. exp(-(0.4 / 0.25)^2) is 0.08; a mirror image may be nearer.
+    assert near["style_error"] == pytest.approx(0.0, abs=0.02)
+    assert near["style"] > 0.98
+    assert far["style"] < 0.2
+
+
 def test_worlds_begin_in_rows_of_their_seeds(folder):
     plugin = create("dog-starts", "bend_30hz.csv")
     cls = EnvSpec(plugin.target).constructor()
@@ -100,7 +121,11 @@ def test_what_is_wrong_with_a_clip_is_printed(folder):
     ("options", "problem"),
     [
         ({"motions": ["bend_30hz.csv"]}, "--motion needs --model"),
-        ({"model": "dog.xml", "motions": ["bend_30hz.csv"], "walk": True}, "--walk and --motion exclude each other"),
+        (
+            {"model": "dog.xml", "motions": ["bend_30hz.csv"], "hand": ["pick"]},
+            "--pick and --motion exclude each other",
+        ),
+        ({"motions": ["bend_30hz.csv"], "walk": True}, "--walk needs --model"),
         ({"model": "dog.xml", "motions": ["bend_30hz.csv"], "link": "head"}, "--motion and --link exclude each other"),
         ({"model": "dog.xml", "walk": True, "clip": ClipOptions(rate=30.0)}, "need --motion"),
         ({"model": "dog.xml", "motions": ["other.csv"]}, "no file other.csv"),

@@ -29,8 +29,22 @@ HOSTILE = [
 NUMBERS = [0.5, -1e300, 1e-300, 0.0, math.inf, -math.inf, math.nan]
 TEMPLATES = [new.TEMPLATE, legged_robot.TEMPLATE, hand_robot.TEMPLATE, motion_robot.TEMPLATE]
 KINDS = [
-    frozenset({"walk", "mirror", "mirror_walk", "origin", "drives", "pick", "one"}),
-    frozenset({"clock", "aside", "mirror", "mirror_clock", "point", "mujoco", "motors", "place", "many"}),
+    frozenset({"walk", "mirror", "mirror_walk", "origin", "drives", "pick", "one", "style", "style_walk"}),
+    frozenset(
+        {
+            "clock",
+            "aside",
+            "mirror",
+            "mirror_clock",
+            "point",
+            "mujoco",
+            "motors",
+            "place",
+            "many",
+            "style",
+            "style_clock",
+        }
+    ),
 ]
 
 
@@ -71,6 +85,7 @@ CODE = {
     "motor_events": '        "voltage": 1,',
     "inclined": " down",
     "towards_held": "+ 0",
+    "both_sides": ", OTHER_SIDE",
 }
 CODE |= dict.fromkeys(
     (
