@@ -147,8 +147,7 @@ def list_unknowns(robot: RobotModel, start: Values, chosen: Collection[str], mov
 def _find_affected(robot: RobotModel, item: Unknown) -> Array:
     if item.quantity == DELAY:
         return np.ones(len(robot.joints), bool)
-    tree = robot.trees[item.index]
-    if item.quantity == MASS:
-        tree = robot.model.body_treeid[item.index]
+    # A mass has the number of its body, everything else that of its joint.
+    tree = robot.model.body_treeid[item.index] if item.quantity == MASS else robot.trees[item.index]
     result: Array = robot.trees == tree
     return result

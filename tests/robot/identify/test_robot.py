@@ -20,12 +20,14 @@ from rlctl_robot.identify.robot_model import (
     BIAS,
     COULOMB,
     DELAY,
+    MASS,
     STIFFNESS,
     VISCOUS,
     read_robot,
     stack_values,
 )
 from rlctl_robot.identify.robot_report import make_mjcf, make_motors, make_ranges, show_robot, write_robot
+from rlctl_robot.identify.unknowns import list_unknowns
 from rlctl_robot.identify.windows import WindowPlayer
 
 ROBOT = Path(__file__).with_name("two_servos.xml")
@@ -130,6 +132,24 @@ def test_values_are_written_as_a_model_and_for_set_motors(identified, tmp_path):
     show_robot(identified, paths, str(tmp_path / "found.json"))
     found = json.loads((tmp_path / "found.json").read_text())
     assert {value["quantity"] for value in found["values"]} == set(HIDDEN)
+
+
+@pytest.mark.slow
+def test_masses_of_links_are_found(recorded, write):
+    robot, targets, _ = recorded
+    heavier = {MASS: [1.0, 1.3, 0.8], DELAY: 0.01}  # of the world, upper and lower
+    found = identify_robot(str(ROBOT), write(positions=play(robot, targets, heavier)), fit=["mass", "delay"], threads=1)
+    for link, factor in (("upper", 1.3), ("lower", 0.8)):
+        value = found.find(link, MASS)
+        assert value.known
+        assert value.value == pytest.approx(factor, rel=0.05)
+
+
+def test_a_mass_moves_the_joints_of_its_tree():
+    robot = read_robot(ROBOT)
+    unknowns = list_unknowns(robot, robot.nominal, ["mass"], range(2))
+    assert [item.part for item in unknowns.items] == list(robot.links) == ["upper", "lower"]
+    assert unknowns.affected.all()
 
 
 def test_a_delay_between_physics_steps_moves_the_commands(recorded):
