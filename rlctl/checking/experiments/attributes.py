@@ -27,9 +27,9 @@ from rlctl.environments.bullet_calls import LIBRARIES, BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
-EPISODES = ("random", "repeated", "extreme", "random", "repeated")
+EPISODES = ("random", "repeated", "extreme", "random", "repeated", "zero", "zero", "zero")
 """How the actions of each episode are chosen."""
-STEPS = 40  # of an episode
+STEPS, ZERO_STEPS = 40, 100  # of an episode; of one in which a robot comes to stand
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
 RATES = ("render_fps", "video.frames_per_second")
@@ -95,9 +95,12 @@ class _Look:
 
 def _play(instance: Instance, calls: BulletCalls, number: int, kind: str) -> Iterator[_Look]:
     watched: list[Attribute] = []
-    for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS):
+    engine = _Engine()
+    longest = ZERO_STEPS if kind == "zero" else STEPS
+    for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=longest):
         if moment.step == 0:
             watched = [one for one in read_attributes(instance.env).values() if one.numbers.size]
+            engine = _Engine.find(instance)
         if not moment.is_readable:
             return
         yield _Look(
@@ -107,8 +110,8 @@ def _play(instance: Instance, calls: BulletCalls, number: int, kind: str) -> Ite
             flatten_action(instance.action_leaves, moment.action) if moment.step else np.zeros(0),
             moment.reward_number if moment.step else np.nan,
             dict(find_numbers(moment.info)) if isinstance(moment.info, dict) else {},
-            _read_speeds(instance),
-            _read_seconds(instance, calls),
+            engine.read_speeds(),
+            engine.read_seconds(calls),
         )
         if moment.step == FEW_STEPS:
             after = [_read(one) for one in watched]
@@ -125,33 +128,45 @@ def _read(attribute: Attribute) -> Numbers:
         return np.zeros(0)
 
 
-def _read_speeds(instance: Instance) -> Numbers:
-    if (simulation := find_mujoco(instance.env)) is not None:
-        return np.array(simulation[1].qvel)
-    parts = []
-    for client in instance.find_clients()[:1]:
-        world = read_world(client)
+@dataclasses.dataclass(frozen=True)
+class _Engine:
+    """The engine of an episode; looking for it takes longer than many a step."""
+
+    model: Any = None
+    data: Any = None
+    client: int | None = None
+
+    @classmethod
+    def find(cls, instance: Instance) -> "_Engine":
+        if (simulation := find_mujoco(instance.env)) is not None:
+            return cls(*simulation)
+        return cls(client=next(iter(instance.find_clients()), None))
+
+    @property
+    def physics_s(self) -> float:
+        """How long a step is [s]; NaN without an engine."""
+        if self.model is not None:
+            return float(self.model.opt.timestep)
+        if self.client is not None:
+            return float(ClientCalls(self.client).getPhysicsEngineParameters()["fixedTimeStep"])
+        return np.nan
+
+    def read_seconds(self, calls: BulletCalls) -> float:
+        """Return how long was simulated [s]."""
+        if self.data is not None:
+            return float(self.data.time)
+        return np.nan if self.client is None else calls.steps[self.client] * self.physics_s
+
+    def read_speeds(self) -> Numbers:
+        """Return the speeds of joints, shape (speeds,)."""
+        if self.data is not None:
+            return np.array(self.data.qvel)
+        if self.client is None:
+            return np.zeros(0)
+        world = read_world(self.client)
         states = zip(world.bodies, read_states(world), strict=True)
         parts = [state[JOINTS + len(body.joints) :] for body, state in states if body.joints]
-    return np.concatenate([np.zeros(0), *parts])
-
-
-def _read_seconds(instance: Instance, calls: BulletCalls) -> float:
-    if (simulation := find_mujoco(instance.env)) is not None:
-        return float(simulation[1].time)
-    clients = instance.find_clients()
-    return calls.steps[clients[0]] * _read_bullet_step(clients[0]) if clients else np.nan
-
-
-def _read_bullet_step(client: int) -> float:
-    return float(ClientCalls(client).getPhysicsEngineParameters()["fixedTimeStep"])
-
-
-def _read_physics_step(instance: Instance) -> float:
-    if (simulation := find_mujoco(instance.env)) is not None:
-        return float(simulation[0].opt.timestep)
-    clients = instance.find_clients()
-    return _read_bullet_step(clients[0]) if clients else np.nan
+        return np.concatenate([np.zeros(0), *parts])
 
 
 def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
@@ -177,7 +192,7 @@ def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
         infos={name: np.array([look.infos.get(name, np.nan) for look in looks]) for name in info_names},
         speeds=np.stack([look.speeds for look in looks]),
         seconds=np.array([look.seconds for look in looks]),
-        physics_s=_read_physics_step(instance),
+        physics_s=_Engine.find(instance).physics_s,
         episodes=np.array([look.episode for look in looks]),
         declared={name: value for name, value in _find_declared(instance.env).items() if name not in names},
         literals=tuple(sorted(_find_literals(instance.env))),

@@ -9,7 +9,7 @@ import numpy as np
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog, Numbers
 from rlctl.checking.records import Records
-from rlctl.checking.rewards import RAW_TERMS
+from rlctl.checking.rewards import RAW_TERMS, TERMS
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import StepTimes, find_rates, find_step_times
 
@@ -61,8 +61,11 @@ def _find_wrong_accelerations(records: Records) -> Iterator[RuleFinding]:
             return
     weights = {1.0, *log.literals, *map(abs, log.declared.values())} - {0.0}
     forms = [form for group in speeds for form in _list_forms(group, steps)]
-    for name, series in {**log.infos, "the reward": log.rewards}.items():
+    is_raw = any(name.startswith(RAW_TERMS) for name in log.infos)
+    for name, series in log.infos.items():
         values = series[steps]
+        if is_raw and name.startswith(TERMS):
+            continue  # the same without its weight tells it
         found = _match(name, values, forms, weights, times) if np.isfinite(values).all() and values.any() else None
         if found is not None:
             message = (
