@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import inspect
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,16 +20,17 @@ from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotJudged
+from rlctl.checking.term_names import is_about_steps
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import NUMBERS, Attribute, find_author, find_numbers, flatten_action, read_attributes
-from rlctl.checking.worlds import JOINTS
+from rlctl.checking.worlds import JOINTS, World
 from rlctl.environments.bullet_calls import LIBRARIES, BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
-EPISODES = ("random", "repeated", "extreme", "random", "repeated", "zero", "zero", "zero")
-"""How the actions of each episode are chosen."""
-STEPS, ZERO_STEPS = 40, 100  # of an episode; of one in which a robot comes to stand
+EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
+"""How the actions of each episode are chosen; with none for robots only whose reward has terms about steps."""
+STEPS, ZERO_STEPS = 30, 100  # of an episode; of one in which a robot comes to stand
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
 RATES = ("render_fps", "video.frames_per_second")
@@ -69,13 +70,16 @@ class AttributeLog:
 def log_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play a few short episodes and read the attributes that change after each step."""
     instance = context.instance
+    clients = instance.find_clients()
     with record_calls(with_results=()) if "pybullet" in sys.modules else contextlib.nullcontext(BulletCalls()) as calls:
         looks: list[_Look] = []
         for number, kind in enumerate(EPISODES):
-            looks += _play(instance, calls, number, kind)
+            if kind == "zero" and not any(is_about_steps(name) for name in looks[-1].infos):
+                break
+            looks += _play(instance, clients, calls, number, kind)
             if context.budget.is_over():
                 break
-    log = _join(instance, looks)
+    log = _join(instance, clients, looks)
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
@@ -93,14 +97,14 @@ class _Look:
     seconds: float
 
 
-def _play(instance: Instance, calls: BulletCalls, number: int, kind: str) -> Iterator[_Look]:
+def _play(instance: Instance, clients: Sequence[int], calls: BulletCalls, number: int, kind: str) -> Iterator[_Look]:
     watched: list[Attribute] = []
     engine = _Engine()
     longest = ZERO_STEPS if kind == "zero" else STEPS
     for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=longest):
         if moment.step == 0:
             watched = [one for one in read_attributes(instance.env).values() if one.numbers.size]
-            engine = _Engine.find(instance)
+            engine = _Engine.find(instance, clients)
         if not moment.is_readable:
             return
         yield _Look(
@@ -134,42 +138,41 @@ class _Engine:
 
     model: Any = None
     data: Any = None
-    client: int | None = None
+    bullet: World | None = None
 
     @classmethod
-    def find(cls, instance: Instance) -> "_Engine":
+    def find(cls, instance: Instance, clients: Sequence[int]) -> "_Engine":
         if (simulation := find_mujoco(instance.env)) is not None:
             return cls(*simulation)
-        return cls(client=next(iter(instance.find_clients()), None))
+        return cls(bullet=read_world(clients[0]) if clients else None)
 
     @property
     def physics_s(self) -> float:
         """How long a step is [s]; NaN without an engine."""
         if self.model is not None:
             return float(self.model.opt.timestep)
-        if self.client is not None:
-            return float(ClientCalls(self.client).getPhysicsEngineParameters()["fixedTimeStep"])
+        if self.bullet is not None:
+            return float(ClientCalls(self.bullet.client).getPhysicsEngineParameters()["fixedTimeStep"])
         return np.nan
 
     def read_seconds(self, calls: BulletCalls) -> float:
         """Return how long was simulated [s]."""
         if self.data is not None:
             return float(self.data.time)
-        return np.nan if self.client is None else calls.steps[self.client] * self.physics_s
+        return np.nan if self.bullet is None else calls.steps[self.bullet.client] * self.physics_s
 
     def read_speeds(self) -> Numbers:
         """Return the speeds of joints, shape (speeds,)."""
         if self.data is not None:
             return np.array(self.data.qvel)
-        if self.client is None:
+        if self.bullet is None:
             return np.zeros(0)
-        world = read_world(self.client)
-        states = zip(world.bodies, read_states(world), strict=True)
+        states = zip(self.bullet.bodies, read_states(self.bullet), strict=True)
         parts = [state[JOINTS + len(body.joints) :] for body, state in states if body.joints]
         return np.concatenate([np.zeros(0), *parts])
 
 
-def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
+def _join(instance: Instance, clients: Sequence[int], looks: list[_Look]) -> AttributeLog | None:
     if len({(look.observed.shape, look.speeds.shape) for look in looks}) != 1:
         return None
     sizes = {name: {look.attributes[name].size for look in looks if name in look.attributes} for name in _names(looks)}
@@ -192,7 +195,7 @@ def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
         infos={name: np.array([look.infos.get(name, np.nan) for look in looks]) for name in info_names},
         speeds=np.stack([look.speeds for look in looks]),
         seconds=np.array([look.seconds for look in looks]),
-        physics_s=_Engine.find(instance).physics_s,
+        physics_s=_Engine.find(instance, clients).physics_s,
         episodes=np.array([look.episode for look in looks]),
         declared={name: value for name, value in _find_declared(instance.env).items() if name not in names},
         literals=tuple(sorted(_find_literals(instance.env))),
@@ -233,8 +236,6 @@ def _find_literals(env: Any) -> set[float]:
     for file in {inspect.getsourcefile(cls) for cls in _own_classes(find_author(env))}:
         with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
             with open(str(file), encoding="utf-8") as source:
-                nodes = ast.walk(ast.parse(source.read()))
-            found |= {
-                abs(float(node.value)) for node in nodes if isinstance(node, ast.Constant) and _is_number(node.value)
-            }
+                values = [node.value for node in ast.walk(ast.parse(source.read())) if isinstance(node, ast.Constant)]
+            found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found

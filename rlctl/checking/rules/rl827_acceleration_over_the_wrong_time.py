@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog, Numbers
@@ -92,16 +93,16 @@ def _list_speeds(log: AttributeLog) -> list[Numbers]:
     return [group[:, first:] for group in groups for first in range(min(MOST_ROOTS, group.shape[1]))]
 
 
-def _list_forms(speeds: Numbers, steps: Sequence[int]) -> Iterator[_Form]:
-    before = np.asarray(steps) - 1
+def _list_forms(speeds: Numbers, steps: NDArray[np.intp]) -> Iterator[_Form]:
+    before = steps - 1
     changes = speeds[steps] - speeds[before]
     yield _Form("the sum of squares", 2, np.square(changes).sum(axis=1), changes.shape[1])
     yield _Form("the sum of sizes", 1, np.abs(changes).sum(axis=1), changes.shape[1])
     yield _Form("the length", 1, np.linalg.norm(changes, axis=1), 1)
 
 
-def _is_change(values: Numbers, speeds: Sequence[Numbers], steps: Sequence[int], times: StepTimes) -> bool:
-    before = np.asarray(steps) - 1
+def _is_change(values: Numbers, speeds: Sequence[Numbers], steps: NDArray[np.intp], times: StepTimes) -> bool:
+    before = steps - 1
     for group in speeds:
         changes = (group[steps] - group[before]) / times.physics_s
         off = np.abs(changes - values[:, None]).max(axis=0)
