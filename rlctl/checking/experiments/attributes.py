@@ -30,7 +30,7 @@ from rlctl.environments.info import find_mujoco
 
 EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
 """How the actions of each episode are chosen; with none for robots only whose reward has terms about steps."""
-STEPS, ZERO_STEPS = 30, 100  # of an episode; of one in which a robot comes to stand
+STEPS, ZERO_STEPS = 30, 200  # of an episode; of one in which a robot comes to stand
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
 RATES = ("render_fps", "video.frames_per_second")
