@@ -72,7 +72,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     instance = context.instance
     clients = instance.find_clients()
     with record_calls(with_results=()) if "pybullet" in sys.modules else contextlib.nullcontext(BulletCalls()) as calls:
-        looks: list[_Look] = []
+        looks: list[_LoggedLook] = []
         for number, kind in enumerate(EPISODES):
             if kind == "zero" and not any(is_about_steps(name) for name in looks[-1].infos):
                 break
@@ -86,7 +86,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
 
 
 @dataclasses.dataclass
-class _Look:
+class _LoggedLook:
     episode: int
     attributes: dict[str, Numbers]
     observed: Numbers
@@ -97,7 +97,9 @@ class _Look:
     seconds: float
 
 
-def _play(instance: Instance, clients: Sequence[int], calls: BulletCalls, number: int, kind: str) -> Iterator[_Look]:
+def _play(
+    instance: Instance, clients: Sequence[int], calls: BulletCalls, number: int, kind: str
+) -> Iterator[_LoggedLook]:
     watched: list[Attribute] = []
     engine = _Engine()
     longest = ZERO_STEPS if kind == "zero" else STEPS
@@ -107,7 +109,7 @@ def _play(instance: Instance, clients: Sequence[int], calls: BulletCalls, number
             engine = _Engine.find(instance, clients)
         if not moment.is_readable:
             return
-        yield _Look(
+        yield _LoggedLook(
             number,
             {one.name: _read(one) for one in watched},
             flatten_floats(instance.leaves, moment.observation),
@@ -172,7 +174,7 @@ class _Engine:
         return np.concatenate([np.zeros(0), *parts])
 
 
-def _join(instance: Instance, clients: Sequence[int], looks: list[_Look]) -> AttributeLog | None:
+def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) -> AttributeLog | None:
     if len({(look.observed.shape, look.speeds.shape) for look in looks}) != 1:
         return None
     sizes = {name: {look.attributes[name].size for look in looks if name in look.attributes} for name in _names(looks)}
@@ -202,7 +204,7 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_Look]) -> Att
     )
 
 
-def _names(looks: list[_Look]) -> list[str]:
+def _names(looks: list[_LoggedLook]) -> list[str]:
     return list(dict.fromkeys(name for look in looks for name in look.attributes))
 
 
