@@ -16,6 +16,7 @@ def turn(angle):
 class Course(Robot):
     """A rover drives along goals that are drawn at once; it sees the way in its frame."""
 
+    rlctl_ignore = {"RL611": "the course is long"}
     refreshes = True
 
     def start(self):
