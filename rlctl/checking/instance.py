@@ -20,6 +20,7 @@ from rlctl.checking.records import CallFailure
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.values import is_task
 from rlctl.environments import registry
+from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.leaves import find_leaves
 from rlctl.environments.mujoco_version import mujoco_fix
@@ -228,8 +229,9 @@ class Budget:
 class Instance:
     """One environment, and how it is called."""
 
-    def __init__(self, env: Any, context: "Context") -> None:
-        """Raises `TaskError` where its observation space cannot be read."""
+    def __init__(self, env: Any, context: "Context", connected: frozenset[int] = frozenset()) -> None:
+        """`connected` are the clients of PyBullet that it connected when it was built. Raises `TaskError` where its
+        observation space cannot be read."""
         try:
             self.leaves = find_leaves(getattr(env, "observation_space", None))
         except Exception as error:
@@ -238,6 +240,7 @@ class Instance:
         self.action_leaves = find_leaves(getattr(env, "action_space", None))
         self.accepts_seed, self.accepts_options = (_accepts(env, name) for name in ("seed", "options"))
         self.context = context
+        self.connected = connected
         self.progress = context.progress
         self.timers: Mapping[str, Timer] = {}  # by the name of the call they time
 
@@ -247,6 +250,11 @@ class Instance:
         from rlctl.environments.wrappers import find_time_limit
 
         return int(self.env.unwrapped.max_steps) if is_task(self.env) else find_time_limit(self.env)
+
+    def find_clients(self) -> list[int]:
+        """Return its clients of PyBullet: those that no other instance connected; all of them if none is left."""
+        clients, others = find_clients(), self.context.connected - self.connected
+        return [client for client in clients if client not in others] or clients
 
     def call(self, name: str, function: Any, *arguments: Any, step: int = 0, **keywords: Any) -> Any:
         """Call into the environment; whatever it raises, `SystemExit` included, is an `EnvironmentRaised`.
@@ -277,6 +285,8 @@ class Instance:
             self.call("close", getattr(self.env, "close", lambda: None))
         except EnvironmentRaised as error:
             return [describe_failure(error, self.progress)]
+        finally:
+            self.context.connected.intersection_update(find_clients())  # others may get the ids of these
         return []
 
 
@@ -294,6 +304,9 @@ class Context:
         self.longest_episode: int | None = None  # of the whole episodes [steps]; None before there are any
         self.reached_limit = False  # whether one of them was truncated
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
+        self.connected: set[int] = set()
+        """The clients of PyBullet that instances connected when they were built. Those that do not close them, or are
+        not closed, leave their worlds beside those of the kept instance."""
 
     def note_episode(self, steps: int, ended: str) -> None:
         """Note how long an episode of the kept instance lasted, and how it ended."""
@@ -307,12 +320,15 @@ class Context:
             # Loaded before it is built, to distinguish an import error from a constructor's.
             self.progress.enter("load")
             registry.load(self.spec.task)
+            older = find_clients()
             self.progress.enter("build")
             began = read_clock()
             env = (spec or self.spec).make(render_mode)
             self.least_s = read_clock() - began
             self.progress.leave()
-            return Instance(env, self)
+            connected = frozenset(find_clients()).difference(older)
+            self.connected |= connected
+            return Instance(env, self, connected)
         except BaseException as error:
             raise EnvironmentRaised("build", error) from error
 

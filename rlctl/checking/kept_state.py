@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_states, read_world
+from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import read_kept_fields
 from rlctl.checking.rule import list_names
 from rlctl.checking.values import Attribute, find_unequal, read_attributes
 from rlctl.checking.worlds import ORIENTATION
-from rlctl.environments.bullet_clients import ClientCalls, find_clients
+from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.leaves import Leaf, pick
 
 MUJOCO, PYBULLET = "MuJoCo", "PyBullet"
@@ -50,11 +51,12 @@ class StateAfterReset:
     observed: Observed
 
 
-def read_state(env: Any, leaves: Sequence[Leaf], observation: Any) -> StateAfterReset:
+def read_state(instance: Instance, observation: Any) -> StateAfterReset:
     """Read the attributes of an instance and the state of its engine; no code of the environment runs."""
-    fields, bodies = read_kept_fields(env), _read_bodies()
+    env = instance.env
+    fields, bodies = read_kept_fields(env), _read_bodies(instance.find_clients())
     engines = dict.fromkeys(fields, MUJOCO) | dict.fromkeys(bodies, PYBULLET)
-    observed = dict(_read_observed(leaves, observation))
+    observed = dict(_read_observed(instance.leaves, observation))
     return StateAfterReset(read_attributes(env) | fields | bodies, engines, observed)
 
 
@@ -100,10 +102,10 @@ def _name_calls(kept: Sequence[KeptState]) -> str:
     return calls
 
 
-def _read_bodies() -> dict[str, Attribute]:
-    """Return what the connected PyBullet clients simulate: positions and velocities of bases and joints."""
+def _read_bodies(clients: Iterable[int]) -> dict[str, Attribute]:
+    """Return what PyBullet clients simulate: positions and velocities of bases and joints."""
     parts: dict[str, NDArray[np.float64]] = {}
-    for client in find_clients():
+    for client in clients:
         with contextlib.suppress(ClientCalls(client).error):  # a body that was removed meanwhile
             world = read_world(client)
             poses = read_poses(world)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.worlds import WorldBody
-from rlctl.environments.bullet_clients import ClientCalls, find_clients
+from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim
@@ -48,9 +48,9 @@ class Reach:
     unit: str = ""
 
 
-def find_chains(env: Any) -> Iterator[Chain]:
-    """Yield the robots of an environment that are fixed to the world, in PyBullet or MuJoCo."""
-    for client in find_clients():
+def find_chains(env: Any, clients: Iterable[int]) -> Iterator[Chain]:
+    """Yield the robots of an environment that are fixed to the world, in its clients of PyBullet or in MuJoCo."""
+    for client in clients:
         for body in read_world(client).bodies:
             if not body.is_free and FEWEST_JOINTS <= len(body.joints) <= MOST_JOINTS:
                 yield _bullet_chain(ClientCalls(client), body)
@@ -68,10 +68,11 @@ def find_chains(env: Any) -> Iterator[Chain]:
             yield _mujoco_chain(mujoco, model, data, joints)
 
 
-def find_objects(env: Any) -> dict[str, Numbers]:
-    """Return where the free bodies without joints are, by name, in PyBullet or MuJoCo [m]. Shape (3,) each."""
+def find_objects(env: Any, clients: Iterable[int]) -> dict[str, Numbers]:
+    """Return where the free bodies without joints of an environment are, by name, in its clients of PyBullet or in
+    MuJoCo [m]. Shape (3,) each."""
     places: dict[str, Numbers] = {}
-    for client in find_clients():
+    for client in clients:
         for body in read_world(client).bodies:
             if body.is_free and not body.joints:
                 places[body.name] = np.array(ClientCalls(client).getBasePositionAndOrientation(body.id)[0])

@@ -118,6 +118,7 @@ class CrankPoints(Pusher):
 
 
 class RL626CrankOtherLink(CrankPoints):
+    rlctl_ignore = {**CrankPoints.rlctl_ignore, "RL611": "a consequence"}
     judged = 1
 
 
@@ -140,6 +141,8 @@ class CrankPlacesCube(CrankPoints):
 
 
 class RL626CrankGoesItself(CrankPlacesCube):
+    rlctl_ignore = {**CrankPlacesCube.rlctl_ignore, "RL611": "a consequence"}
+
     def info(self, success):
         return {"is_success": bool(np.linalg.norm(self.goal - self.tip()) < 0.03)}
 

@@ -116,7 +116,7 @@ def test_what_the_joints_do_not_move_is_not_the_hand():
 def test_the_reach_of_a_task_in_mujoco_is_measured_by_its_joints():
     with contextlib.closing(EnvSpec("reach", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
-        *_, chain = find_chains(env)  # other tests may have left PyBullet's
+        *_, chain = find_chains(env, ())
         reach = measure_reach(chain, chain.names.index("arm/lbr_iiwa_link_7"), range(3))
     # The stretched arm: 0.9 m from the shoulder, which is 0.2 m above the first joint.
     assert reach.distance == pytest.approx(1.1, abs=0.01)
@@ -133,7 +133,7 @@ def test_the_joints_of_an_arm_do_not_move_what_it_pushes(tmp_path):
     )
     with contextlib.closing(EnvSpec(f"{pushing}:Push", sim=MUJOCO).make()) as env:
         env.reset(seed=0)
-        *_, chain = find_chains(env)
+        *_, chain = find_chains(env, ())
     assert {name.partition("/")[0] for name in chain.names} == {"arm"}
 
 

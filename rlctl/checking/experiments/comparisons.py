@@ -39,7 +39,7 @@ def _find_kept(instance: Instance) -> list[KeptState]:
     read = []
     for steps in (0, KEPT_STEPS, 0):
         moment = EpisodePlayer(instance, FIRST_SEED, max_steps=0).reset()
-        read.append(read_state(instance.env, instance.leaves, moment.observation))
+        read.append(read_state(instance, moment.observation))
         for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=steps):
             pass
     return find_kept(*read)

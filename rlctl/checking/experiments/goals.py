@@ -211,7 +211,7 @@ class GoalTrials:
         if episode.has_ended or episode.has_succeeded or episode.step(episode.goal).succeeds:
             return {}
         places: dict[str, Numbers] = {}
-        for chain in find_chains(self.instance.env):
+        for chain in find_chains(self.instance.env, self.instance.find_clients()):
             places |= dict(zip(chain.names, chain.read()[:, self.drawn.place.axes], strict=True))
         return places
 
@@ -389,6 +389,9 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
     if size != two.numbers.size:
         return []
     drawn = tuple(np.flatnonzero(one.numbers != two.numbers).tolist())
+    rows = np.shape(one.value)
+    if len(rows) == 2 and rows[0] > 1 and rows[1] in SIZES[1:] and len(drawn) == size:  # the first of several goals
+        return [DrawnPlace(one.name, tuple(range(rows[1])))]
     if len(drawn) not in SIZES or len(drawn) < min(2, size):
         return []
     found = [DrawnPlace(one.name, tuple(range(size)))] if size in SIZES else []
@@ -446,7 +449,7 @@ def _find_reaches(instance: Instance, place: DrawnPlace, copies: Sequence[Source
         first = EpisodePlayer(instance, seed, max_steps=0).reset()
         rows.append(flatten_floats(instance.leaves, first.observation))
         goals.append(place.read(instance.env))
-        chains = list(find_chains(instance.env))
+        chains = list(find_chains(instance.env, instance.find_clients()))
         if not chains:
             return {}
         links.append([chain.read() for chain in chains])

@@ -19,7 +19,7 @@ from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats
-from rlctl.environments.bullet_clients import ClientCalls, find_clients
+from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
 STEPS, STEPS_WITHOUT_LIMIT = 450, 1_100  # of an episode that declares a time limit, and of any other
@@ -51,7 +51,7 @@ class HeldEpisode:
 def hold_robot(context: Context) -> Iterator[ChildMessage]:
     """Play a few episodes, each with another seed, in which the engine is put back before each step."""
     instance = context.instance
-    if find_mujoco(instance.env) is None and not find_clients():
+    if find_mujoco(instance.env) is None and not instance.find_clients():
         raise NotApplicable("no world of PyBullet or MuJoCo")
     longest = STEPS if instance.max_steps else STEPS_WITHOUT_LIMIT
     if context.longest_episode is None:  # the process of the experiment `episodes` ended
@@ -134,7 +134,7 @@ class _Holder:
     def _save(self) -> None:
         if (simulation := find_mujoco(self._instance.env)) is not None:
             self._save_data(*simulation)
-        for client in find_clients():
+        for client in self._instance.find_clients():
             self._save_client(ClientCalls(client))
         self.failed |= not self._restore
 

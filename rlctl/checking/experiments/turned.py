@@ -5,7 +5,7 @@ Nothing but its heading is another one then: on level ground the robot moves as 
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats
-from rlctl.environments.bullet_clients import ClientCalls, find_clients
+from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 from rlctl.task.rotations import from_axis, multiply, roll_pitch_yaw, rotate
 
@@ -51,7 +51,7 @@ class TurnedRobot:
             return None
         player = EpisodePlayer(self.instance, FIRST_SEED + number, "zero", max_steps=1)
         player.reset()
-        heading = _turn(self.instance.env, angle, speed)
+        heading = _turn(self.instance, angle, speed)
         moment = player.step()
         observed = flatten_floats(self.instance.leaves, moment.observation)
         return TurnedStep(heading, observed, moment.reward_number)
@@ -68,17 +68,17 @@ def turn_robot(context: Context) -> Iterator[ChildMessage]:
     if not instance.accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
     EpisodePlayer(instance, FIRST_SEED, max_steps=0).reset()
-    if not _can_turn(instance.env):
+    if not _can_turn(instance):
         raise NotApplicable("no robot with a free base on level ground, in PyBullet or MuJoCo")
     robot = TurnedRobot(instance)
     robot.play(0, 0.0)  # an instance's first episode may differ from all others
     yield from judges_turned.judge(robot)
 
 
-def _can_turn(env: Any) -> bool:
-    if (simulation := find_mujoco(env)) is not None:
+def _can_turn(instance: Instance) -> bool:
+    if (simulation := find_mujoco(instance.env)) is not None:
         return _is_level(*simulation)
-    return len(_find_free_bodies()) == 1
+    return len(_find_free_bodies(instance.find_clients())) == 1
 
 
 def _is_level(model: Any, data: Any) -> bool:
@@ -91,11 +91,11 @@ def _is_level(model: Any, data: Any) -> bool:
     return is_plane and len(roots) == 1 and int((model.jnt_type == FREE).sum()) == 1
 
 
-def _find_free_bodies() -> list[tuple[ClientCalls, int]]:
+def _find_free_bodies(clients: Iterable[int]) -> list[tuple[ClientCalls, int]]:
     """Return the free bodies of PyBullet; none where something static is higher than the lowest point of one."""
     found: list[tuple[ClientCalls, int]] = []
     tops: list[float] = []
-    for client in find_clients():
+    for client in clients:
         p = ClientCalls(client)
         for body in read_world(client).bodies:
             if body.is_free:
@@ -116,11 +116,11 @@ def _is_level_plane(p: ClientCalls, body: int) -> bool:
     return bool(high[0] - low[0] > ENDLESS and rotate(orientation, UP)[2] > 1 - 1e-9)
 
 
-def _turn(env: Any, angle: float, speed: float) -> float:
+def _turn(instance: Instance, angle: float, speed: float) -> float:
     """Turn the free robot about the vertical, and set its velocity; return its heading [rad]."""
-    if (simulation := find_mujoco(env)) is not None:
+    if (simulation := find_mujoco(instance.env)) is not None:
         return _turn_in_mujoco(*simulation, angle, speed)
-    (p, body), *_ = _find_free_bodies()
+    (p, body), *_ = _find_free_bodies(instance.find_clients())
     place, orientation = p.getBasePositionAndOrientation(body)
     linear, angular = p.getBaseVelocity(body)
     turn = from_axis(UP, angle)

@@ -6,8 +6,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking import attitudes
+from rlctl.checking.body_frames import BodyFrame, find_body_frames
+from rlctl.checking.engine_values import NOISY, is_white
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.readings import NEARLY_ALL
+from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
@@ -19,7 +24,9 @@ RULE = Rule(
         Three elements of the observation are the velocity of a free body, turned by its orientation in the wrong
         direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both
         velocities of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its
-        angular velocity, qvel[3:6], is in the frame of the body already.
+        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity. A robot without an
+        engine is read from its attributes: its velocity is what changes its position, its frame the one in which its
+        actions push it.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
@@ -39,13 +46,48 @@ class _Vectors:
     name: str
     right: Sequence[Array]
     wrong: Array
+    is_down: bool = False
+    """Whether it is gravity: the opposite is an axis of the body, in the world."""
 
 
 @judges_worlds(RULE)
 def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for one in watched.observed:
-        for vectors in _list_velocities(one):
-            yield from _find_in_observation(one, vectors)
+        for vectors in [*_list_velocities(one), *_list_gravities(one)]:
+            yield from _find_in_observation(one.observed, vectors)
+
+
+@judges_records(RULE, "worlds", "attributes")
+def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
+    log: AttributeLog | None = records.facts.get("attributes")
+    if log is None or np.isfinite(log.physics_s):
+        return  # the engine tells more
+    for frame in find_body_frames(log):
+        for vectors in _list_vectors(frame):
+            for finding in _find_in_observation(log.observed, vectors):
+                yield finding
+                return
+
+
+def _list_vectors(frame: BodyFrame) -> Iterator[_Vectors]:
+    """Yield velocity and gravity of a robot without an engine."""
+    down = np.zeros_like(frame.velocity)
+    down[:, -1] = -1.0
+    for name, vectors, is_down in ((frame.velocity_name, frame.velocity, False), ("gravity", down, True)):
+        inside = np.einsum("nji,nj->ni", frame.matrices, vectors)
+        outside = np.einsum("nij,nj->ni", frame.matrices, vectors)
+        if frame.falls or not is_down:
+            yield _Vectors(name, [vectors, inside], outside, is_down)
+
+
+def _list_gravities(one: ObservedWorld) -> Iterator[_Vectors]:
+    """Yield the direction of gravity for each free body."""
+    for body in one.logs[0].world.bodies:
+        if body.is_free:
+            quaternions = np.array([poses[body.id, -1][ORIENTATION] for log in one.logs for poses in log.poses])
+            down = np.tile([0.0, 0.0, -1.0], (len(quaternions), 1))
+            turned = attitudes.rotate(quaternions, down)
+            yield _Vectors(f"gravity, as {body.name} feels it", [down, turned[:, :3]], turned[:, 3:6], True)
 
 
 def _list_velocities(one: ObservedWorld) -> Iterator[_Vectors]:
@@ -72,19 +114,29 @@ def _turn(name: str, values: Array, quaternions: Array, *, is_own: bool) -> _Vec
     return _Vectors(name, [values, inside, level], outside)
 
 
-def _find_in_observation(one: ObservedWorld, vectors: _Vectors) -> Iterator[RuleFinding]:
-    for column in range(one.observed.shape[1] - 2):
-        block = one.observed[:, column : column + 3]
-        if not _fits(block, vectors.wrong) or any(_fits(block, right) for right in vectors.right):
+def _find_in_observation(observed: Array, vectors: _Vectors) -> Iterator[RuleFinding]:
+    size = vectors.wrong.shape[1]
+    for column in range(observed.shape[1] - size + 1):
+        block = observed[:, column : column + size]
+        if not _fits(block, vectors, vectors.wrong) or any(_fits(block, vectors, right) for right in vectors.right):
             continue
-        name = f"observation[{column}:{column + 3}]"
+        name = f"observation[{column}:{column + size}]"
         message = f"{name} is {vectors.name}, turned by the orientation the wrong way: in no frame of the robot"
         yield RuleFinding(RULE, message, {"element": name, "value": vectors.name})
         return
 
 
-def _fits(block: Array, vectors: Array) -> bool:
-    """Say whether three elements are vectors times a factor."""
-    factor = float((block * vectors).sum() / max(1e-12, np.square(vectors).sum()))
-    near = np.abs(block - factor * vectors) <= SAME * (1 + np.abs(block))
-    return abs(factor) > LEAST_FACTOR and bool(near.all(axis=1).mean() >= NEARLY_ALL)
+def _fits(block: Array, vectors: _Vectors, values: Array) -> bool:
+    """Say whether elements are vectors times a factor, exactly or with noise."""
+    factor = float((block * values).sum() / max(1e-12, np.square(values).sum()))
+    rest = block - factor * values
+    near = np.abs(rest) <= SAME * (1 + np.abs(block))
+    is_factor = factor > LEAST_FACTOR or (factor < -LEAST_FACTOR and not vectors.is_down)
+    is_exact = bool(near.all(axis=1).mean() >= NEARLY_ALL)
+    return is_factor and (is_exact or _is_noise(block, rest))
+
+
+def _is_noise(block: Array, rest: Array) -> bool:
+    moving = block - block.mean(axis=0)
+    size = float(np.square(moving).sum())
+    return size > 0 and float(np.square(rest).sum()) < NOISY * size and is_white(rest.T.ravel())

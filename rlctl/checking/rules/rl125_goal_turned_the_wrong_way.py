@@ -2,18 +2,18 @@
 
 import collections
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_world
 from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, judges_goals
+from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.worlds import ORIENTATION, Array, Poses, World
-from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
@@ -67,7 +67,7 @@ def _find_wrong_frame(trials: GoalTrials, element: int) -> str:
         if episode.has_ended:
             continue
         turn = episode.read_turn(element)
-        for frame, quaternion in _read_orientations(trials.instance.env).items():
+        for frame, quaternion in _read_orientations(trials.instance).items():
             matrices = [m for m in _list_turns(quaternion, len(turn)) if np.abs(m - m.T).max() >= LEAST_TURN]
             if any(_is_same_turn(turn, matrix.T) for matrix in matrices):
                 return ""
@@ -91,14 +91,14 @@ def _list_turns(quaternion: Array, size: int) -> list[Array]:
     return [level, matrix] if size == 3 else [level[:size, :size]]
 
 
-def _read_orientations(env: Any) -> dict[_Frame, Array]:
+def _read_orientations(instance: Instance) -> dict[_Frame, Array]:
     """Return the quaternions, x, y, z, w, of free bodies."""
     worlds: list[tuple[World, Poses]] = []
-    if (simulation := find_mujoco(env)) is not None:
+    if (simulation := find_mujoco(instance.env)) is not None:
         reader = MujocoStateReader(*simulation)
         reader.update()
         worlds.append((reader.world, reader.read_poses()))
-    for client in find_clients():  # others may be connected that other instances have
+    for client in instance.find_clients():
         world = read_world(client)
         worlds.append((world, read_poses(world)))
     return {

@@ -80,7 +80,8 @@ def _find_object_sources(trials: GoalTrials) -> dict[Source, str]:
     names: dict[Source, set[str]] = {}
     for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
         episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
-        objects = {name: place[trials.drawn.place.axes] for name, place in find_objects(trials.instance.env).items()}
+        places = find_objects(trials.instance.env, trials.instance.find_clients())
+        objects = {name: place[trials.drawn.place.axes] for name, place in places.items()}
         for source in candidates:
             place = episode.read(source)
             near = {name for name, there in objects.items() if np.abs(there - place).max() < NEAR}

@@ -1,0 +1,243 @@
+"""The experiment `attributes`: logs what an instance holds in its attributes, for rules about robots of any kind.
+
+A robot that is written in NumPy has its state there, and clocks and other things that are counted are there in all.
+"""
+
+import ast
+import contextlib
+import dataclasses
+import inspect
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.bullet_worlds import read_states, read_world
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiment import PROBE, experiment
+from rlctl.checking.instance import Context, Instance
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
+from rlctl.checking.rule import NotJudged
+from rlctl.checking.term_names import is_about_steps
+from rlctl.checking.transitions import flatten_floats
+from rlctl.checking.values import NUMBERS, Attribute, find_author, find_numbers, flatten_action, read_attributes
+from rlctl.checking.worlds import JOINTS, World
+from rlctl.environments.bullet_calls import LIBRARIES, BulletCalls, record_calls
+from rlctl.environments.bullet_clients import ClientCalls
+from rlctl.environments.info import find_mujoco
+
+EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
+"""How the actions of each episode are chosen; with none for robots only whose reward has terms about steps."""
+STEPS, ZERO_STEPS = 30, 200  # of an episode; of one in which a robot comes to stand
+FEW_STEPS = 3  # in which an attribute has to change to be logged
+MOST_NUMBERS = 400
+RATES = ("render_fps", "video.frames_per_second")
+"""Where metadata has the frame rate [Hz]."""
+Numbers = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AttributeLog:
+    """What was logged at each look: after the reset, and after each step of some episodes."""
+
+    names: list[str]  # of the numbers that change: `self.velocity[0]`
+    values: Numbers  # Shape (looks, names)
+    observed: Numbers  # The numbers that are floats. Shape (looks, elements)
+    actions: Numbers  # Shape (looks, numbers); 0 at a reset
+    rewards: Numbers  # Shape (looks,); NaN at a reset, and where it is no number
+    infos: Mapping[str, Numbers]  # numbers of info by name. Shape (looks,) each; NaN where there is none
+    speeds: Numbers  # of joints that the engine has; in MuJoCo all of qvel. Shape (looks, speeds)
+    seconds: Numbers  # that the engine has simulated. Shape (looks,); NaN without an engine
+    physics_s: float  # one step of the engine [s]; NaN without one
+    episodes: NDArray[np.int64]  # Shape (looks,)
+    declared: Mapping[str, float]  # numbers of the object, its class and its module that do not change, by name
+    literals: tuple[float, ...]  # numbers in the source of its classes
+
+    @property
+    def is_step(self) -> NDArray[np.bool_]:
+        """Whether a look is after a step, and not after a reset. Shape (looks,)."""
+        return np.asarray(np.concatenate([[False], self.episodes[1:] == self.episodes[:-1]]))
+
+    def changes(self, rows: Numbers) -> Numbers:
+        """Return how rows change in each step. Shape (steps, columns)."""
+        steps = np.flatnonzero(self.is_step)
+        return np.asarray(rows[steps] - rows[steps - 1])
+
+
+@experiment("attributes", PROBE, 107, share=0.2)
+def log_attributes(context: Context) -> Iterator[ChildMessage]:
+    """Play a few short episodes and read the attributes that change after each step."""
+    instance = context.instance
+    clients = instance.find_clients()
+    with record_calls(with_results=()) if "pybullet" in sys.modules else contextlib.nullcontext(BulletCalls()) as calls:
+        looks: list[_LoggedLook] = []
+        for number, kind in enumerate(EPISODES):
+            if kind == "zero" and not any(is_about_steps(name) for name in looks[-1].infos):
+                break
+            looks += _play(instance, clients, calls, number, kind)
+            if context.budget.is_over():
+                break
+    log = _join(instance, clients, looks)
+    if log is None:
+        raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
+    yield Fact("attributes", log)
+
+
+@dataclasses.dataclass
+class _LoggedLook:
+    episode: int
+    attributes: dict[str, Numbers]
+    observed: Numbers
+    action: Numbers
+    reward: float
+    infos: dict[str, float]
+    speeds: Numbers
+    seconds: float
+
+
+def _play(
+    instance: Instance, clients: Sequence[int], calls: BulletCalls, number: int, kind: str
+) -> Iterator[_LoggedLook]:
+    watched: list[Attribute] = []
+    engine = _Engine()
+    longest = ZERO_STEPS if kind == "zero" else STEPS
+    for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=longest):
+        if moment.step == 0:
+            watched = [one for one in read_attributes(instance.env).values() if one.numbers.size]
+            engine = _Engine.find(instance, clients)
+        if not moment.is_readable:
+            return
+        yield _LoggedLook(
+            number,
+            {one.name: _read(one) for one in watched},
+            flatten_floats(instance.leaves, moment.observation),
+            flatten_action(instance.action_leaves, moment.action) if moment.step else np.zeros(0),
+            moment.reward_number if moment.step else np.nan,
+            dict(find_numbers(moment.info)) if isinstance(moment.info, dict) else {},
+            engine.read_speeds(),
+            engine.read_seconds(calls),
+        )
+        if moment.step == FEW_STEPS:
+            after = [_read(one) for one in watched]
+            watched = [
+                one for one, now in zip(watched, after, strict=True) if not np.array_equal(one.numbers, now)
+            ]  # reading all takes longer than many a step
+
+
+def _read(attribute: Attribute) -> Numbers:
+    holder = attribute.owner if isinstance(attribute.owner, dict) else vars(attribute.owner)
+    try:
+        return np.ravel(np.array(holder[attribute.key], np.float64))
+    except (KeyError, TypeError, ValueError):
+        return np.zeros(0)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Engine:
+    """The engine of an episode; looking for it takes longer than many a step."""
+
+    model: Any = None
+    data: Any = None
+    bullet: World | None = None
+
+    @classmethod
+    def find(cls, instance: Instance, clients: Sequence[int]) -> "_Engine":
+        if (simulation := find_mujoco(instance.env)) is not None:
+            return cls(*simulation)
+        return cls(bullet=read_world(clients[0]) if clients else None)
+
+    @property
+    def physics_s(self) -> float:
+        """How long a step is [s]; NaN without an engine."""
+        if self.model is not None:
+            return float(self.model.opt.timestep)
+        if self.bullet is not None:
+            return float(ClientCalls(self.bullet.client).getPhysicsEngineParameters()["fixedTimeStep"])
+        return np.nan
+
+    def read_seconds(self, calls: BulletCalls) -> float:
+        """Return how long was simulated [s]."""
+        if self.data is not None:
+            return float(self.data.time)
+        return np.nan if self.bullet is None else calls.steps[self.bullet.client] * self.physics_s
+
+    def read_speeds(self) -> Numbers:
+        """Return the speeds of joints, shape (speeds,)."""
+        if self.data is not None:
+            return np.array(self.data.qvel)
+        if self.bullet is None:
+            return np.zeros(0)
+        states = zip(self.bullet.bodies, read_states(self.bullet), strict=True)
+        parts = [state[JOINTS + len(body.joints) :] for body, state in states if body.joints]
+        return np.concatenate([np.zeros(0), *parts])
+
+
+def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) -> AttributeLog | None:
+    if len({(look.observed.shape, look.speeds.shape) for look in looks}) != 1:
+        return None
+    sizes = {name: {look.attributes[name].size for look in looks if name in look.attributes} for name in _names(looks)}
+    always = [n for n in sizes if len(sizes[n]) == 1 and all(n in look.attributes for look in looks)]
+    parts = [np.stack([look.attributes[name] for look in looks]) for name in always]
+    values = np.hstack([np.zeros((len(looks), 0)), *parts])[:, :MOST_NUMBERS]
+    names = [
+        n if part.shape[1] == 1 else f"{n}[{i}]"
+        for n, part in zip(always, parts, strict=True)
+        for i in range(part.shape[1])
+    ]
+    width = max(look.action.size for look in looks)
+    info_names = {name: None for look in looks for name in look.infos}
+    return AttributeLog(
+        names=names[:MOST_NUMBERS],
+        values=np.nan_to_num(values),
+        observed=np.nan_to_num(np.stack([look.observed for look in looks]).astype(np.float64)),
+        actions=np.stack([np.resize(look.action, width) if look.action.size else np.zeros(width) for look in looks]),
+        rewards=np.array([look.reward for look in looks]),
+        infos={name: np.array([look.infos.get(name, np.nan) for look in looks]) for name in info_names},
+        speeds=np.stack([look.speeds for look in looks]),
+        seconds=np.array([look.seconds for look in looks]),
+        physics_s=_Engine.find(instance, clients).physics_s,
+        episodes=np.array([look.episode for look in looks]),
+        declared={name: value for name, value in _find_declared(instance.env).items() if name not in names},
+        literals=tuple(sorted(_find_literals(instance.env))),
+    )
+
+
+def _names(looks: list[_LoggedLook]) -> list[str]:
+    return list(dict.fromkeys(name for look in looks for name in look.attributes))
+
+
+def _find_declared(env: Any) -> dict[str, float]:
+    """Return the numbers of the author's object, of its classes, and of the modules of these, by name."""
+    author = find_author(env)
+    found: dict[str, float] = {}
+    for cls in reversed(_own_classes(author)):
+        spaces = [vars(sys.modules.get(cls.__module__, cls)), vars(cls)]
+        found |= {name: float(value) for space in spaces for name, value in space.items() if _is_number(value)}
+    metadata = getattr(author, "metadata", None)
+    if isinstance(metadata, dict):
+        found |= {name: float(metadata[name]) for name in RATES if _is_number(metadata.get(name))}
+    own = read_attributes(env)
+    return found | {name: float(one.numbers[0]) for name, one in own.items() if _is_number(one.value)}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_)
+
+
+def _own_classes(author: Any) -> list[type]:
+    return [
+        cls for cls in type(author).__mro__ if cls.__module__.partition(".")[0] not in (*LIBRARIES, "typing", "abc")
+    ]
+
+
+def _find_literals(env: Any) -> set[float]:
+    """Return the numbers that the source of its classes' modules has."""
+    found: set[float] = set()
+    for file in {inspect.getsourcefile(cls) for cls in _own_classes(find_author(env))}:
+        with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
+            with open(str(file), encoding="utf-8") as source:
+                values = [node.value for node in ast.walk(ast.parse(source.read())) if isinstance(node, ast.Constant)]
+            found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
+    return found

@@ -1,0 +1,115 @@
+"""How long a step takes, and a step of the physics in it: from the engine, or from what a robot in NumPy declares."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from rlctl.checking.experiments.attributes import RATES, AttributeLog, Numbers
+from rlctl.checking.term_names import split_name
+
+SUBSTEP_WORDS = {"substeps", "substep", "decimation", "skip", "frameskip", "repeat", "inner"}
+"""Of names that say how many steps of the physics a step has."""
+TIME_WORDS = {"dt", "timestep", "step"}
+MOST_SUBSTEPS = 200
+LEAST_MOTION = 1e-6
+SAME = 0.99  # correlation of a change and of what changes by it
+NEAR = 0.25  # relative error of a time that is estimated from positions and velocities
+EXACT = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class StepTimes:
+    """Times of a robot with several steps of the physics in each step."""
+
+    control_s: float  # of a step
+    physics_s: float  # of a step of the physics
+    source: str  # that says so: `MuJoCo`, or names of attributes
+
+    @property
+    def substeps(self) -> int:
+        """How many steps of the physics a step has."""
+        return round(self.control_s / self.physics_s)
+
+
+def find_step_times(log: AttributeLog) -> StepTimes | None:
+    """Return the times of a robot; None where they are not known, and where each step has one step of the physics."""
+    times = _read_engine(log) if math.isfinite(log.physics_s) else _read_declared(log)
+    return times if times is not None and times.substeps > 1 else None
+
+
+def _read_engine(log: AttributeLog) -> StepTimes | None:
+    control_s = float(np.median(log.changes(log.seconds[:, None]))) if log.is_step.any() else 0.0
+    is_whole = log.physics_s > 0 and math.isclose(
+        control_s / log.physics_s, round(control_s / log.physics_s), abs_tol=0.01
+    )
+    return StepTimes(control_s, log.physics_s, "the engine") if is_whole and control_s > 0 else None
+
+
+def _read_declared(log: AttributeLog) -> StepTimes | None:
+    """Return the two times of which what is declared says one, and how positions follow velocities shows which."""
+    named = {
+        name: round(value)
+        for name, value in log.declared.items()
+        if set(words_of(name)) & SUBSTEP_WORDS and value == round(value) and 1 < value <= MOST_SUBSTEPS
+    }
+    # A module may have constants of another robot.
+    counts = {name: count for name, count in named.items() if name.startswith("self.")} or named
+    times = {name: value for name, value in log.declared.items() if set(words_of(name)) & TIME_WORDS and 0 < value < 1}
+    times |= {name: 1 / log.declared[name] for name in RATES if log.declared.get(name, 0) > 1}
+    if len(set(counts.values())) != 1 or not times:
+        return None
+    (substeps,) = set(counts.values())
+    shown = estimate_step(log)
+    if shown is None:
+        return None
+    for name, value in times.items():
+        for control_s in (value, value * substeps):
+            # The other one is at least twice as long.
+            if abs(shown / control_s - 1) < NEAR:
+                return StepTimes(control_s, control_s / substeps, f"{name} and {next(iter(counts))}")
+    return None
+
+
+def words_of(name: str) -> list[str]:
+    """Return the words of the last part of a name: of `self.cfg['gait_period']` these are `gait` and `period`."""
+    last = name.rpartition(".")[2].rpartition("[")[2] or name
+    return split_name(last)
+
+
+def estimate_step(log: AttributeLog) -> float | None:
+    """Return how long a step takes by what changes by its velocity, among attributes and in the observation [s]."""
+    found: list[float] = []
+    for rows in (log.values, log.observed):
+        found += [seconds for _, _, seconds in find_rates(log, rows)]
+    if not found:
+        return None
+    median = float(np.median(found))
+    return median if np.mean(np.abs(np.array(found) / median - 1) < NEAR) > 0.5 else None
+
+
+def find_rates(log: AttributeLog, rows: Numbers) -> list[tuple[int, int, float]]:
+    """Return which column changes by which other one, and by how much of it in each step [s]."""
+    steps = np.flatnonzero(log.is_step)
+    changes = log.changes(rows)
+    if len(steps) < 10 or not rows.shape[1]:
+        return []
+    moving = changes.std(axis=0) > LEAST_MOTION
+    best = np.zeros((rows.shape[1], rows.shape[1]))
+    seconds = np.zeros_like(best)
+    usual = np.abs(changes) <= np.quantile(np.abs(changes), 0.97, axis=0)  # angles wrap now and then
+    kept = np.where(usual, changes, 0.0)
+    for rates in (rows[steps], rows[steps - 1], (rows[steps] + rows[steps - 1]) / 2):
+        sizes = np.einsum("nq,ne->qe", usual.astype(float), np.square(rates))
+        products = np.einsum("nq,ne->qe", kept, rates)
+        correlation = products / np.maximum(np.linalg.norm(kept, axis=0)[:, None] * np.sqrt(sizes), 1e-300)
+        is_better = correlation > best
+        best = np.where(is_better, correlation, best)
+        seconds = np.where(is_better, products / np.maximum(sizes, 1e-300), seconds)
+    np.fill_diagonal(best, 0.0)
+    rate_of = best.argmax(axis=1)
+    return [
+        (column, int(rate), float(seconds[column, rate]))
+        for column, rate in enumerate(rate_of.tolist())
+        if moving[column] and best[column, rate] > SAME and seconds[column, rate] > 0
+    ]
