@@ -137,7 +137,6 @@ def _measure_rests(log: AttributeLog, velocity: Numbers, matrices: Numbers, fall
     steps = np.flatnonzero(log.is_step)
     before, after = velocity[steps - 1], velocity[steps]
     actions = np.hstack([np.ones((len(steps), 1)), log.actions[steps]])
-    size = velocity.shape[1]
     acceleration = after - before
     rests = [_find_rest(_list_pushes(log, velocity, matrices), acceleration.reshape(-1, 1))]
     inside = np.einsum("nji,nj->ni", matrices, velocity)

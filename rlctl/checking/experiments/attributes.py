@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.bullet_worlds import read_states, read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
@@ -21,6 +22,7 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import NUMBERS, Attribute, find_author, find_numbers, flatten_action, read_attributes
+from rlctl.checking.worlds import JOINTS
 from rlctl.environments.bullet_calls import LIBRARIES, BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
@@ -45,6 +47,7 @@ class AttributeLog:
     actions: Numbers  # Shape (looks, numbers); 0 at a reset
     rewards: Numbers  # Shape (looks,); NaN at a reset, and where it is no number
     infos: Mapping[str, Numbers]  # numbers of info by name. Shape (looks,) each; NaN where there is none
+    speeds: Numbers  # of joints that the engine has; in MuJoCo all of qvel. Shape (looks, speeds)
     seconds: Numbers  # that the engine has simulated. Shape (looks,); NaN without an engine
     physics_s: float  # one step of the engine [s]; NaN without one
     episodes: NDArray[np.int64]  # Shape (looks,)
@@ -86,6 +89,7 @@ class _Look:
     action: Numbers
     reward: float
     infos: dict[str, float]
+    speeds: Numbers
     seconds: float
 
 
@@ -103,6 +107,7 @@ def _play(instance: Instance, calls: BulletCalls, number: int, kind: str) -> Ite
             flatten_action(instance.action_leaves, moment.action) if moment.step else np.zeros(0),
             moment.reward_number if moment.step else np.nan,
             dict(find_numbers(moment.info)) if isinstance(moment.info, dict) else {},
+            _read_speeds(instance),
             _read_seconds(instance, calls),
         )
         if moment.step == FEW_STEPS:
@@ -118,6 +123,17 @@ def _read(attribute: Attribute) -> Numbers:
         return np.ravel(np.array(holder[attribute.key], np.float64))
     except (KeyError, TypeError, ValueError):
         return np.zeros(0)
+
+
+def _read_speeds(instance: Instance) -> Numbers:
+    if (simulation := find_mujoco(instance.env)) is not None:
+        return np.array(simulation[1].qvel)
+    parts = []
+    for client in instance.find_clients()[:1]:
+        world = read_world(client)
+        states = zip(world.bodies, read_states(world), strict=True)
+        parts = [state[JOINTS + len(body.joints) :] for body, state in states if body.joints]
+    return np.concatenate([np.zeros(0), *parts])
 
 
 def _read_seconds(instance: Instance, calls: BulletCalls) -> float:
@@ -139,7 +155,7 @@ def _read_physics_step(instance: Instance) -> float:
 
 
 def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
-    if len({look.observed.shape for look in looks}) != 1:
+    if len({(look.observed.shape, look.speeds.shape) for look in looks}) != 1:
         return None
     sizes = {name: {look.attributes[name].size for look in looks if name in look.attributes} for name in _names(looks)}
     always = [n for n in sizes if len(sizes[n]) == 1 and all(n in look.attributes for look in looks)]
@@ -159,6 +175,7 @@ def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
         actions=np.stack([np.resize(look.action, width) if look.action.size else np.zeros(width) for look in looks]),
         rewards=np.array([look.reward for look in looks]),
         infos={name: np.array([look.infos.get(name, np.nan) for look in looks]) for name in info_names},
+        speeds=np.stack([look.speeds for look in looks]),
         seconds=np.array([look.seconds for look in looks]),
         physics_s=_read_physics_step(instance),
         episodes=np.array([look.episode for look in looks]),

@@ -389,6 +389,9 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
     if size != two.numbers.size:
         return []
     drawn = tuple(np.flatnonzero(one.numbers != two.numbers).tolist())
+    rows = np.shape(one.value)
+    if len(rows) == 2 and rows[0] > 1 and rows[1] in SIZES[1:] and len(drawn) == size:  # the first of several goals
+        return [DrawnPlace(one.name, tuple(range(rows[1])))]
     if len(drawn) not in SIZES or len(drawn) < min(2, size):
         return []
     found = [DrawnPlace(one.name, tuple(range(size)))] if size in SIZES else []

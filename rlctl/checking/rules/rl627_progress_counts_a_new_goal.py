@@ -1,0 +1,108 @@
+"""RL627: progress counts a new goal."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from rlctl.checking.experiments.goals import (
+    MOST_SOURCES,
+    PLACED_STEPS,
+    GoalEpisode,
+    GoalTrials,
+    Numbers,
+    Source,
+    judges_goals,
+)
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.rule import Rule, RuleFinding, Severity
+
+RULE = Rule(
+    "RL627",
+    "progress counts a new goal",
+    Severity.WARNING,
+    meaning="""
+        The reward pays progress, the distance before minus the distance now, and where a goal is reached and the next
+        one is drawn, the distance before is still that to the old goal. The first step towards the new goal is paid as
+        if the robot had been carried away by the whole way between both: the more goals it reaches, the more it loses.
+        The check put the goal at the robot, so that the environment went on to the next one.
+    """,
+    fix="Compute the distance to the new goal where the goal changes, and keep that as the distance before.",
+)
+
+EPISODES, MOST_EPISODES = 3, 8  # in which the next goal came, that are needed and that are tried
+LEAST_WAY = 0.1  # part of the goals' range: what is farther is another goal
+CALM = 5.0  # times as large as the changes of later rewards
+SAME = 0.3  # relative difference of what is lost per way
+VARIED = 1.2  # the longest of the ways is so many times the shortest
+
+
+class _Switch(NamedTuple):
+    """A step after the goal has changed."""
+
+    way: float  # to the new goal
+    jump: float  # of the reward against the steps that follow
+    noise: float  # how far these differ
+
+
+@judges_goals(RULE)
+def _find_counted_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
+    shown = next(iter([*trials.drawn.copies, *trials.drawn.turned]))
+    episode = GoalEpisode(trials, FIRST_SEED, "zero", PLACED_STEPS)
+    if episode.has_ended:
+        yield Skipped(RULE.id, "episodes are too short, or begin with a success", applies=False)
+        return
+    for source in trials.list_sources(episode)[:MOST_SOURCES]:
+        switches: list[_Switch] = []
+        for seed in range(FIRST_SEED, FIRST_SEED + MOST_EPISODES):
+            switch = _play(trials, source, shown, seed)
+            if switch is None and not switches and seed > FIRST_SEED:
+                break
+            switches += [] if switch is None else [switch]
+            if len(switches) == EPISODES:
+                break
+        if len(switches) == EPISODES:
+            yield from _judge(trials, switches)
+            return
+    yield Skipped(RULE.id, "no other goal followed when one was reached", applies=False)
+
+
+def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Switch | None:
+    """Put the goal at a place by a source; return what the next steps pay if another goal follows."""
+    episode = GoalEpisode(trials, seed, "zero", PLACED_STEPS)
+    if episode.has_ended:
+        return None
+    is_absolute = np.allclose(_read(episode, shown), episode.goal, atol=1e-4)
+    place = episode.read(source)
+    episode.step(place)
+    way = 0.0 if episode.has_ended else _measure_way(episode, shown, place, is_absolute=is_absolute)
+    if way < LEAST_WAY * float(np.linalg.norm(trials.range)):
+        return None
+    rewards = np.array([step.reward for step in episode.play([None] * 4)])
+    if len(rewards) < 4 or not np.isfinite(rewards).all():
+        return None
+    return _Switch(way, float(rewards[0] - np.median(rewards[1:])), float(np.ptp(rewards[1:])))
+
+
+def _measure_way(episode: GoalEpisode, shown: Source, place: Numbers, *, is_absolute: bool) -> float:
+    """Return how far the goal that is observed now is from the place at which it was put."""
+    block = _read(episode, shown)
+    return float(np.linalg.norm(block - place if is_absolute else block))
+
+
+def _read(episode: GoalEpisode, shown: Source) -> Numbers:
+    return episode.observed[shown[0] : shown[0] + episode.goal.size]
+
+
+def _judge(trials: GoalTrials, switches: list[_Switch]) -> Iterator[RuleFinding]:
+    ways, jumps, noise = (np.array(column) for column in zip(*switches, strict=True))
+    lost = -jumps / ways
+    is_clear = bool((jumps < -CALM * np.maximum(noise, 1e-6)).all()) and ways.max() > VARIED * ways.min()
+    if is_clear and np.ptp(lost) < SAME * lost.mean():
+        name, loss = trials.drawn.name, float(lost.mean())
+        message = (
+            f"the step after {name} was reached pays {-jumps[0]:.3g} less than the following ones, and the next goal"
+        )
+        message += f" is {ways[0]:.3g} away: {loss:.3g} per way in {len(switches)} episodes, as if the robot had moved"
+        evidence = {"element": name, "seed": FIRST_SEED, "value": float(jumps[0]), "expected": 0.0}
+        yield RuleFinding(RULE, message, evidence)
