@@ -4,6 +4,7 @@ import ast
 import contextlib
 import dataclasses
 import inspect
+import math
 import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -13,45 +14,140 @@ from rlctl.checking.values import NUMBERS, find_author, list_own_classes
 CONVERSIONS = {"float", "float32", "float64", "item", "asarray", "array"}
 """Functions that return what they are given."""
 DEEPEST = 6  # names and methods that are followed
-Functions = dict[str, ast.FunctionDef]
+COMPUTED, UNKNOWN = "computed", math.nan  # what else than a known number a factor may be
+Factor = float | str
+Place = tuple[str, int]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Scope:
-    """Where an expression is: what its names may mean."""
+class _Source:
+    """The code of one module, in which expressions are read."""
 
     author: Any
-    module: Mapping[str, Any]
-    methods: Functions
-    states: frozenset[str]  # Attributes that other methods than the constructor assign
-    function: ast.FunctionDef | None
+    file: str
+    names: Mapping[str, Any]  # of the module
+    functions: list[ast.FunctionDef]
+    states: frozenset[str]  # attributes that other methods than the constructor assign
 
-    def find_local(self, name: str) -> list[ast.expr]:
-        """Return what is assigned to a local name."""
-        if self.function is None:
-            return []
-        assignments = [node for node in ast.walk(self.function) if isinstance(node, ast.Assign)]
-        return [
-            node.value
-            for node in assignments
-            if any(isinstance(target, ast.Name) and target.id == name for target in node.targets)
-        ]
+    def list_entries(self) -> Iterator[tuple[str, list[Factor], Place]]:
+        """Yield each value that gets a constant key in a dictionary, as its key, its factors and its place."""
+        for function in self.functions:
+            for node in ast.walk(function):
+                for key, value in _read_entries(node):
+                    yield key, self.list_factors(value, function), (self.file, value.lineno)
+
+    def list_factors(self, value: ast.expr, function: ast.FunctionDef, depth: int = 0) -> list[Factor]:
+        """Return the factors of a product; of anything else, the value itself is the only one."""
+        if depth > DEEPEST:
+            return [UNKNOWN]
+
+        def follow(part: ast.expr, inside: ast.FunctionDef = function) -> list[Factor]:
+            return self.list_factors(part, inside, depth + 1)
+
+        match value:
+            case ast.UnaryOp(operand=operand):
+                return follow(operand)
+            case ast.BinOp(left=left, op=ast.Mult(), right=right):
+                return follow(left) + follow(right)
+            case ast.BinOp(left=left, op=ast.Div()):
+                return follow(left)
+            case ast.Constant(value=str()):
+                return []  # a unit, or a name
+            case ast.Constant(value=number):
+                return [float(number) if isinstance(number, NUMBERS) else UNKNOWN]
+            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=[only]) if name in CONVERSIONS:
+                return follow(only)
+            case ast.Call(func=ast.Attribute(value=ast.Name(id="self"), attr=name)):
+                method = next((one for one in self.functions if one.name == name), None)
+                returned = [node.value for node in ast.walk(method) if isinstance(node, ast.Return)] if method else []
+                return follow(returned[0], method) if method and len(returned) == 1 and returned[0] else [UNKNOWN]
+            case ast.Name(id=name):
+                assigned = _find_assigned(function, name)
+                if assigned:
+                    return follow(assigned[0]) if len(assigned) == 1 else [UNKNOWN]
+                return [self._read_number(value)]
+            case ast.Attribute(value=ast.Name(id="self"), attr=name) if name in self.states:
+                return [COMPUTED]
+            case ast.Attribute() | ast.Subscript():
+                return [self._read_number(value)]
+            case ast.BinOp() | ast.Call() | ast.Compare():
+                return [COMPUTED]
+        return [UNKNOWN]
+
+    def _read_number(self, value: ast.expr) -> float:
+        """Return the present number of a name, an attribute or an entry; `UNKNOWN` where it is none."""
+        found = self._look_up(value)
+        return float(found) if isinstance(found, NUMBERS) else UNKNOWN
+
+    def _look_up(self, value: ast.expr) -> Any:
+        match value:
+            case ast.Name(id="self"):
+                return self.author
+            case ast.Name(id=name):
+                return self.names.get(name)
+            case ast.Attribute(value=owner, attr=name):
+                found = self._look_up(owner)
+                return inspect.getattr_static(found, name, None) if found is not None else None
+            case ast.Subscript(value=owner, slice=ast.Constant(value=key)):
+                found = self._look_up(owner)
+                return found.get(key) if isinstance(found, dict) else None
+        return None
 
 
-def find_weighed_terms(env: Any) -> dict[str, tuple[str, int]]:
-    """Return file and line of each entry of a dictionary, by its key, that is computed and multiplied by known numbers
-    other than 0, and that has no weight of 0 or of unknown size anywhere."""
+def find_weighed_terms(env: Any) -> dict[str, Place]:
+    """Return file and line of what is computed for each key of a dictionary that the source has, where it is multiplied
+    by known numbers other than 0, and the key has no other weight."""
     author = find_author(env)
-    entries: dict[str, list[_Entry]] = {}
-    for file, module in {inspect.getsourcefile(cls): cls.__module__ for cls in list_own_classes(env)}.items():
+    entries: dict[str, list[tuple[list[Factor], Place]]] = {}
+    for cls in list_own_classes(author):
         with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
-            with open(str(file), encoding="utf-8") as source:
-                tree = ast.parse(source.read())
-            for name, entry in _read_entries(tree, str(file), author, vars(sys.modules[module])):
-                entries.setdefault(name, []).append(entry)
-    zero = {key for value in vars(author).values() if isinstance(value, dict) for key in value if value[key] is 0.0}
-    return {
-        name: next(entry.where for entry in found if None in entry.factors)
-        for name, found in entries.items()
-        if name not in zero and _is_weighed([factor for entry in found for factor in entry.factors])
-    }
+            for key, factors, place in _read_source(cls, author).list_entries():
+                entries.setdefault(key, []).append((factors, place))
+    held = {key: value for one in vars(author).values() if isinstance(one, dict) for key, value in one.items()}
+    found = {}
+    for key, listed in entries.items():
+        factors = [factor for some, _ in listed for factor in some]
+        factors += [float(held[key])] if isinstance(held.get(key), NUMBERS) else []
+        weights = [factor for factor in factors if factor != COMPUTED]
+        if COMPUTED in factors and weights and all(isinstance(w, float) and w and math.isfinite(w) for w in weights):
+            found[key] = next(place for some, place in listed if COMPUTED in some)
+    return found
+
+
+def _read_source(cls: type, author: Any) -> _Source:
+    file = str(inspect.getsourcefile(cls))
+    with open(file, encoding="utf-8") as source:
+        tree = ast.parse(source.read())
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    states = frozenset(
+        node.attr
+        for function in functions
+        if function.name != "__init__"
+        for node in ast.walk(function)
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+    )
+    return _Source(author, file, vars(sys.modules[cls.__module__]), functions, states)
+
+
+def _read_entries(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    match node:
+        case ast.Dict(keys=keys, values=values):
+            for key, value in zip(keys, values, strict=True):
+                if isinstance(key, ast.Constant) and isinstance(key.value, str):
+                    yield key.value, value
+        case ast.Assign(targets=[ast.Subscript(slice=ast.Constant(value=str(key)))], value=value):
+            yield key, value
+        case ast.Call(func=ast.Name(id="dict"), keywords=keywords):
+            for keyword in keywords:
+                if keyword.arg:
+                    yield keyword.arg, keyword.value
+
+
+def _find_assigned(function: ast.FunctionDef, name: str) -> list[ast.expr]:
+    """Return what a function assigns to a local name."""
+    found = []
+    for node in ast.walk(function):
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+            found.append(node.value)
+    return found

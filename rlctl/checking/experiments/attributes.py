@@ -19,11 +19,21 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
+from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotJudged
+from rlctl.checking.term_weights import find_weighed_terms
 from rlctl.checking.transitions import flatten_floats
-from rlctl.checking.values import NUMBERS, Attribute, find_author, find_numbers, flatten_action, read_attributes
+from rlctl.checking.values import (
+    NUMBERS,
+    Attribute,
+    find_author,
+    find_numbers,
+    flatten_action,
+    list_own_classes,
+    read_attributes,
+)
 from rlctl.checking.worlds import JOINTS
-from rlctl.environments.bullet_calls import LIBRARIES, BulletCalls, record_calls
+from rlctl.environments.bullet_calls import BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
@@ -32,6 +42,8 @@ EPISODES = ("random", "repeated", "extreme", "random", "repeated")
 STEPS = 40  # of an episode
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
+WEIGHED_TERMS = "weighed terms"
+"""The fact with what `find_weighed_terms` returns."""
 RATES = ("render_fps", "video.frames_per_second")
 """Where metadata has the frame rate [Hz]."""
 Numbers = NDArray[np.float64]
@@ -79,6 +91,8 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
+    if any(name.startswith(TERMS) for name in log.infos):
+        yield Fact(WEIGHED_TERMS, find_weighed_terms(instance.env))
 
 
 @dataclasses.dataclass
@@ -192,7 +206,7 @@ def _find_declared(env: Any) -> dict[str, float]:
     """Return the numbers of the author's object, of its classes, and of the modules of these, by name."""
     author = find_author(env)
     found: dict[str, float] = {}
-    for cls in reversed(_own_classes(author)):
+    for cls in reversed(list_own_classes(author)):
         spaces = [vars(sys.modules.get(cls.__module__, cls)), vars(cls)]
         found |= {name: float(value) for space in spaces for name, value in space.items() if _is_number(value)}
     metadata = getattr(author, "metadata", None)
@@ -206,16 +220,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_)
 
 
-def _own_classes(author: Any) -> list[type]:
-    return [
-        cls for cls in type(author).__mro__ if cls.__module__.partition(".")[0] not in (*LIBRARIES, "typing", "abc")
-    ]
-
-
 def _find_literals(env: Any) -> set[float]:
     """Return the numbers that the source of its classes' modules has."""
     found: set[float] = set()
-    for file in {inspect.getsourcefile(cls) for cls in _own_classes(find_author(env))}:
+    for file in {inspect.getsourcefile(cls) for cls in list_own_classes(find_author(env))}:
         with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
             with open(str(file), encoding="utf-8") as source:
                 nodes = ast.walk(ast.parse(source.read()))
