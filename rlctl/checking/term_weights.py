@@ -114,11 +114,17 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
     return found
 
 
-def _read_source(cls: type, author: Any) -> _Source:
+def list_functions(cls: type) -> tuple[str, list[ast.FunctionDef]]:
+    """Return the file of a class, and all functions that it has; raises `OSError`, `TypeError`, `SyntaxError` and
+    `ValueError` where it cannot be read."""
     file = str(inspect.getsourcefile(cls))
     with open(file, encoding="utf-8") as source:
         tree = ast.parse(source.read())
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return file, [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+
+
+def _read_source(cls: type, author: Any) -> _Source:
+    file, functions = list_functions(cls)
     states = frozenset(
         node.attr
         for function in functions
