@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import inspect
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -84,7 +84,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     with record_calls(with_results=()) if "pybullet" in sys.modules else contextlib.nullcontext(BulletCalls()) as calls:
         looks: list[_Look] = []
         for number, kind in enumerate(EPISODES):
-            looks += _play(instance, calls, number, kind)
+            looks += _play(instance, calls, number, kind, set(looks[-1].attributes) if looks else None)
             if context.budget.is_over():
                 break
     log = _join(instance, looks)
@@ -107,11 +107,15 @@ class _Look:
     seconds: float
 
 
-def _play(instance: Instance, calls: BulletCalls, number: int, kind: str) -> Iterator[_Look]:
+def _play(
+    instance: Instance, calls: BulletCalls, number: int, kind: str, names: Collection[str] | None
+) -> Iterator[_Look]:
+    """Play an episode; `names` are the attributes that changed in an earlier one."""
     watched: list[Attribute] = []
     for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS):
         if moment.step == 0:
-            watched = [one for one in read_attributes(instance.env).values() if one.numbers.size]
+            every = read_attributes(instance.env).values()
+            watched = [one for one in every if one.numbers.size and (names is None or one.name in names)]
         if not moment.is_readable:
             return
         yield _Look(
@@ -124,7 +128,7 @@ def _play(instance: Instance, calls: BulletCalls, number: int, kind: str) -> Ite
             _read_speeds(instance),
             _read_seconds(instance, calls),
         )
-        if moment.step == FEW_STEPS:
+        if moment.step == FEW_STEPS and names is None:
             after = [_read(one) for one in watched]
             watched = [
                 one for one, now in zip(watched, after, strict=True) if not np.array_equal(one.numbers, now)
