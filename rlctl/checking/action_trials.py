@@ -94,15 +94,17 @@ class Trials:
 
         chosen = self.actions(seed, steps)
         for step in range(len(chosen)) if at is None else [at]:
-            chosen[step] = self._change(chosen[step], values)
+            chosen[step] = self.change(chosen[step], values)
         return self.play(seed, chosen)
 
     def with_first(self, seed: int, steps: int, values: Mapping[ActionNumber, Any]) -> list[Frame]:
         """Play an episode of zero actions but for some numbers of the first one."""
         nothing = zero_action(self.instance.env.action_space)
-        return self.play(seed, [self._change(nothing, values), *[nothing] * (steps - 1)])
+        return self.play(seed, [self.change(nothing, values), *[nothing] * (steps - 1)])
 
-    def _change(self, action: Any, values: Mapping[ActionNumber, Any]) -> Any:
+    def change(self, action: Any, values: Mapping[ActionNumber, Any]) -> Any:
+        """Return an action with some numbers set to values."""
+
         def value_of(leaf: Leaf) -> Any:
             part = np.array(pick(action, leaf.path))
             for dimension, value in values.items():

@@ -28,6 +28,12 @@ OPPOSITE_WORDS = {
 """What turns the meaning of the other words around."""
 
 
+STEPPING_WORDS = {"clearance", "airtime", "swing", "lift", "liftoff"}
+"""What feet do while a robot walks, and not while it stands."""
+GRASP_WORDS = {"grasp", "grasped", "grasping", "grip", "gripping", "pinch", "hold", "holding", "clamp", "squeeze"}
+OPEN_WORDS = {"open", "opening", "opened", "release", "released"}
+
+
 def split_name(name: str) -> list[str]:
     """Return the words of a name in lower case: `actionRate`, `action_rate` and `Action rate` have the same."""
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
@@ -50,3 +56,26 @@ def is_error(name: str) -> bool:
     """Say whether a term is a size that is better small, such as a distance."""
     words = set(split_name(name))
     return bool(words & (ERROR_WORDS | COST_WORDS | ACTION_WORDS)) and not words & OPPOSITE_WORDS
+
+
+def is_about_steps(name: str) -> bool:
+    """Say whether a term is about feet in the air: their clearance, or how long they are there."""
+    words = set(split_name(name))
+    is_lift = bool(words & STEPPING_WORDS) or {"air", "time"} <= words or ("height" in words and _has_feet(words))
+    return is_lift and not words & COST_WORDS and not words & GRASP_WORDS
+
+
+def _has_feet(words: Collection[str]) -> bool:
+    return bool(set(words) & {"foot", "feet"})
+
+
+def is_about_grasps(name: str) -> bool:
+    """Say whether a term pays that a gripper holds something."""
+    words = set(split_name(name))
+    return bool(words & GRASP_WORDS) and not words & (COST_WORDS | OPEN_WORDS | OPPOSITE_WORDS - {"bonus", "reward"})
+
+
+def is_paid(name: str) -> bool:
+    """Say whether a number of info is a term of the reward: one of a dictionary of them, or called so."""
+    folder, _, term = name.rpartition("/")
+    return bool({"reward", "rewards", "rew", "terms"} & {*split_name(folder or term)})

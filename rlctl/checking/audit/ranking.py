@@ -2,13 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from rlctl.checking.audit.competitors import LEARNED, OTHERS, SHIPPED, WANTED, Kind
 from rlctl.checking.audit.play_world import PlayedEpisode
 from rlctl.checking.rewards import discounted_steps
+from rlctl.checking.term_names import is_about_steps
 
 NEARLY = 0.9  # part of the wanted return that one who does not even try must not earn
 AS_MUCH = 0.99  # part of the wanted return that one who does less than is wanted must not earn
@@ -16,6 +17,7 @@ SUCCEEDS = 0.5  # success rate from which on a play is what the task wants
 MUCH = 0.1  # part of a return that a term must differ by, to be named for it
 CLEARLY = 0.05  # part of a return that one must earn more than one who stands still, to be paid for what it does
 FAR = 0.3  # difference of terms and length from which on two behaviours have nothing in common
+STANDING_PAYS = 0.2  # part of what a term for steps pays at most, that it must not pay for standing still
 AS_SIMPLE = 0.05  # part of a return: of competitors that earn as much, the simplest is named
 
 
@@ -84,10 +86,12 @@ class Ranking:
     beaten: Sequence[Beaten]  # the one to name first
     learned: str = ""  # what the policy of a run has learned, as a sentence
     next_best: str = ""  # who comes nearest to what is wanted, as part of a sentence
+    paid_still: Sequence[str] = ()  # what terms for steps pay one who stands still, a sentence each
 
 
 KINDS = {one.name: one.kind for one in (*WANTED, *OTHERS)} | {SHIPPED: Kind.wanted, LEARNED: Kind.learned}
 MOVED = {one.name for one in OTHERS if one.is_moved}
+STANDING, FOLLOWING = "standing still", "following the command"
 DOING_NOTHING = [one.name for one in OTHERS if one.does_nothing]
 LESSONS = {one.name: one.lesson for one in (*WANTED, *OTHERS)} | {SHIPPED: "what the shipped policy does"}
 
@@ -114,7 +118,22 @@ def rank(played: Sequence[PlayedEpisode], has_success: bool) -> Ranking:
     if acting and not moved:  # without effort they would seem nearer than they are
         others = [row for row in others if row.name not in MOVED]
     following = _describe_next(rows[wanted], others[0]) if wanted and others else ""
-    return Ranking(ordered, wanted, why, _order(beaten), _describe_learned(rows, wanted), following)
+    return Ranking(
+        ordered, wanted, why, _order(beaten), _describe_learned(rows, wanted), following, list(_describe_standing(rows))
+    )
+
+
+def _describe_standing(rows: Mapping[str, MeanScore]) -> Iterator[str]:
+    """Yield for a robot that is to follow a command `feet_clearance pays standing still 80 % of the most it pays`."""
+    still = rows.get(STANDING)
+    if still is None or FOLLOWING not in rows:
+        return
+    for term, value in still.terms.items():
+        paid = value / max(still.steps, 1.0)
+        most, name = max((row.terms.get(term, 0.0) / max(row.steps, 1.0), row.name) for row in rows.values())
+        if is_about_steps(term) and paid > STANDING_PAYS * most > 0:
+            share = "the most that it pays" if name == STANDING else f"what it pays {name}"
+            yield f"{term} pays standing still {100 * paid / most:.0f} % of {share}: it should pay nothing then"
 
 
 def _describe_next(best: MeanScore, row: MeanScore) -> str:

@@ -23,6 +23,8 @@ def show(report: AuditReport, json: str | None) -> None:
     out.print(Text(f"{report.task}: {report.verdict}", style if out.is_terminal else ""))
     if others := _name_others(report):
         out.print(others)
+    for sentence in report.ranking.paid_still:
+        out.print(sentence)
     if report.ranking.learned:
         out.print(report.ranking.learned)
     _print_rows(report)
@@ -90,6 +92,7 @@ def to_json(report: AuditReport) -> dict[str, Any]:
             }
             for one in ranking.beaten
         ],
+        "paid_still": list(ranking.paid_still),
         "learned": ranking.learned or None,
         "competitors": [
             {

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import inspect
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotJudged
+from rlctl.checking.term_names import is_about_steps
 from rlctl.checking.term_weights import find_weighed_terms
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import (
@@ -32,14 +33,14 @@ from rlctl.checking.values import (
     list_own_classes,
     read_attributes,
 )
-from rlctl.checking.worlds import JOINTS
+from rlctl.checking.worlds import JOINTS, World
 from rlctl.environments.bullet_calls import BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
-EPISODES = ("random", "repeated", "extreme", "random", "repeated")
-"""How the actions of each episode are chosen."""
-STEPS = 40  # of an episode
+EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
+"""How the actions of each episode are chosen; with none for robots only whose reward has terms about steps."""
+STEPS, ZERO_STEPS = 30, 100  # of an episode; of one in which a robot comes to stand
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
 WEIGHED_TERMS = "weighed terms"
@@ -81,13 +82,17 @@ class AttributeLog:
 def log_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play a few short episodes and read the attributes that change after each step."""
     instance = context.instance
+    clients = instance.find_clients()
     with record_calls(with_results=()) if "pybullet" in sys.modules else contextlib.nullcontext(BulletCalls()) as calls:
         looks: list[_Look] = []
         for number, kind in enumerate(EPISODES):
-            looks += _play(instance, calls, number, kind, set(looks[-1].attributes) if looks else None)
+            if kind == "zero" and not any(is_about_steps(name) for name in looks[-1].infos):
+                break
+            names = set(looks[-1].attributes) if looks else None
+            looks += _play(instance, clients, calls, number, kind, names)
             if context.budget.is_over():
                 break
-    log = _join(instance, looks)
+    log = _join(instance, clients, looks)
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
@@ -108,14 +113,22 @@ class _Look:
 
 
 def _play(
-    instance: Instance, calls: BulletCalls, number: int, kind: str, names: Collection[str] | None
+    instance: Instance,
+    clients: Sequence[int],
+    calls: BulletCalls,
+    number: int,
+    kind: str,
+    names: Collection[str] | None,
 ) -> Iterator[_Look]:
     """Play an episode; `names` are the attributes that changed in an earlier one."""
     watched: list[Attribute] = []
-    for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS):
+    engine = _Engine()
+    longest = ZERO_STEPS if kind == "zero" else STEPS
+    for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=longest):
         if moment.step == 0:
             every = read_attributes(instance.env).values()
             watched = [one for one in every if one.numbers.size and (names is None or one.name in names)]
+            engine = _Engine.find(instance, clients)
         if not moment.is_readable:
             return
         yield _Look(
@@ -125,8 +138,8 @@ def _play(
             flatten_action(instance.action_leaves, moment.action) if moment.step else np.zeros(0),
             moment.reward_number if moment.step else np.nan,
             dict(find_numbers(moment.info)) if isinstance(moment.info, dict) else {},
-            _read_speeds(instance),
-            _read_seconds(instance, calls),
+            engine.read_speeds(),
+            engine.read_seconds(calls),
         )
         if moment.step == FEW_STEPS and names is None:
             after = [_read(one) for one in watched]
@@ -143,36 +156,47 @@ def _read(attribute: Attribute) -> Numbers:
         return np.zeros(0)
 
 
-def _read_speeds(instance: Instance) -> Numbers:
-    if (simulation := find_mujoco(instance.env)) is not None:
-        return np.array(simulation[1].qvel)
-    parts = []
-    for client in instance.find_clients()[:1]:
-        world = read_world(client)
-        states = zip(world.bodies, read_states(world), strict=True)
+@dataclasses.dataclass(frozen=True)
+class _Engine:
+    """The engine of an episode; looking for it takes longer than many a step."""
+
+    model: Any = None
+    data: Any = None
+    bullet: World | None = None
+
+    @classmethod
+    def find(cls, instance: Instance, clients: Sequence[int]) -> "_Engine":
+        if (simulation := find_mujoco(instance.env)) is not None:
+            return cls(*simulation)
+        return cls(bullet=read_world(clients[0]) if clients else None)
+
+    @property
+    def physics_s(self) -> float:
+        """How long a step is [s]; NaN without an engine."""
+        if self.model is not None:
+            return float(self.model.opt.timestep)
+        if self.bullet is not None:
+            return float(ClientCalls(self.bullet.client).getPhysicsEngineParameters()["fixedTimeStep"])
+        return np.nan
+
+    def read_seconds(self, calls: BulletCalls) -> float:
+        """Return how long was simulated [s]."""
+        if self.data is not None:
+            return float(self.data.time)
+        return np.nan if self.bullet is None else calls.steps[self.bullet.client] * self.physics_s
+
+    def read_speeds(self) -> Numbers:
+        """Return the speeds of joints, shape (speeds,)."""
+        if self.data is not None:
+            return np.array(self.data.qvel)
+        if self.bullet is None:
+            return np.zeros(0)
+        states = zip(self.bullet.bodies, read_states(self.bullet), strict=True)
         parts = [state[JOINTS + len(body.joints) :] for body, state in states if body.joints]
-    return np.concatenate([np.zeros(0), *parts])
+        return np.concatenate([np.zeros(0), *parts])
 
 
-def _read_seconds(instance: Instance, calls: BulletCalls) -> float:
-    if (simulation := find_mujoco(instance.env)) is not None:
-        return float(simulation[1].time)
-    clients = instance.find_clients()
-    return calls.steps[clients[0]] * _read_bullet_step(clients[0]) if clients else np.nan
-
-
-def _read_bullet_step(client: int) -> float:
-    return float(ClientCalls(client).getPhysicsEngineParameters()["fixedTimeStep"])
-
-
-def _read_physics_step(instance: Instance) -> float:
-    if (simulation := find_mujoco(instance.env)) is not None:
-        return float(simulation[0].opt.timestep)
-    clients = instance.find_clients()
-    return _read_bullet_step(clients[0]) if clients else np.nan
-
-
-def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
+def _join(instance: Instance, clients: Sequence[int], looks: list[_Look]) -> AttributeLog | None:
     if len({(look.observed.shape, look.speeds.shape) for look in looks}) != 1:
         return None
     sizes = {name: {look.attributes[name].size for look in looks if name in look.attributes} for name in _names(looks)}
@@ -195,7 +219,7 @@ def _join(instance: Instance, looks: list[_Look]) -> AttributeLog | None:
         infos={name: np.array([look.infos.get(name, np.nan) for look in looks]) for name in info_names},
         speeds=np.stack([look.speeds for look in looks]),
         seconds=np.array([look.seconds for look in looks]),
-        physics_s=_read_physics_step(instance),
+        physics_s=_Engine.find(instance, clients).physics_s,
         episodes=np.array([look.episode for look in looks]),
         declared={name: value for name, value in _find_declared(instance.env).items() if name not in names},
         literals=tuple(sorted(_find_literals(instance.env))),
@@ -230,8 +254,6 @@ def _find_literals(env: Any) -> set[float]:
     for file in {inspect.getsourcefile(cls) for cls in list_own_classes(find_author(env))}:
         with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
             with open(str(file), encoding="utf-8") as source:
-                nodes = ast.walk(ast.parse(source.read()))
-            found |= {
-                abs(float(node.value)) for node in nodes if isinstance(node, ast.Constant) and _is_number(node.value)
-            }
+                values = [node.value for node in ast.walk(ast.parse(source.read())) if isinstance(node, ast.Constant)]
+            found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found

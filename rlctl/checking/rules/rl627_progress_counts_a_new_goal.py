@@ -52,7 +52,8 @@ def _find_counted_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     if episode.has_ended:
         yield Skipped(RULE.id, "episodes are too short, or begin with a success", applies=False)
         return
-    for source in trials.list_sources(episode)[:MOST_SOURCES]:
+    known = trials.at_goal.source
+    for source in trials.list_sources(episode)[:MOST_SOURCES] if known is None else [known]:
         switches: list[_Switch] = []
         for seed in range(FIRST_SEED, FIRST_SEED + MOST_EPISODES):
             switch = _play(trials, source, shown, seed)

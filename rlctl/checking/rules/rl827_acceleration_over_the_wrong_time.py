@@ -5,11 +5,12 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog, Numbers
 from rlctl.checking.records import Records
-from rlctl.checking.rewards import RAW_TERMS
+from rlctl.checking.rewards import RAW_TERMS, TERMS
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import StepTimes, find_rates, find_step_times
 
@@ -61,8 +62,11 @@ def _find_wrong_accelerations(records: Records) -> Iterator[RuleFinding]:
             return
     weights = {1.0, *log.literals, *map(abs, log.declared.values())} - {0.0}
     forms = [form for group in speeds for form in _list_forms(group, steps)]
-    for name, series in {**log.infos, "the reward": log.rewards}.items():
+    is_raw = any(name.startswith(RAW_TERMS) for name in log.infos)
+    for name, series in log.infos.items():
         values = series[steps]
+        if is_raw and name.startswith(TERMS):
+            continue  # the same without its weight tells it
         found = _match(name, values, forms, weights, times) if np.isfinite(values).all() and values.any() else None
         if found is not None:
             message = (
@@ -89,16 +93,16 @@ def _list_speeds(log: AttributeLog) -> list[Numbers]:
     return [group[:, first:] for group in groups for first in range(min(MOST_ROOTS, group.shape[1]))]
 
 
-def _list_forms(speeds: Numbers, steps: Sequence[int]) -> Iterator[_Form]:
-    before = np.asarray(steps) - 1
+def _list_forms(speeds: Numbers, steps: NDArray[np.intp]) -> Iterator[_Form]:
+    before = steps - 1
     changes = speeds[steps] - speeds[before]
     yield _Form("the sum of squares", 2, np.square(changes).sum(axis=1), changes.shape[1])
     yield _Form("the sum of sizes", 1, np.abs(changes).sum(axis=1), changes.shape[1])
     yield _Form("the length", 1, np.linalg.norm(changes, axis=1), 1)
 
 
-def _is_change(values: Numbers, speeds: Sequence[Numbers], steps: Sequence[int], times: StepTimes) -> bool:
-    before = np.asarray(steps) - 1
+def _is_change(values: Numbers, speeds: Sequence[Numbers], steps: NDArray[np.intp], times: StepTimes) -> bool:
+    before = steps - 1
     for group in speeds:
         changes = (group[steps] - group[before]) / times.physics_s
         off = np.abs(changes - values[:, None]).max(axis=0)
