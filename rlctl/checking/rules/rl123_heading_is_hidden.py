@@ -43,9 +43,10 @@ Pair = tuple[TurnedStep, TurnedStep]
 def _find_hidden_heading(robot: TurnedRobot) -> Iterator[RuleFinding]:
     """Yield a finding where turning changes the reward as moving does, and nothing of the observation."""
     is_sound = False
+    shown: list[tuple[Pair, float]] = []
     for speed, lift in WAYS:
-        if is_sound and not lift:
-            return
+        if (is_sound or shown) and not lift:
+            break
         found: list[Pair] = []
         for number in range(EPISODES):
             played = _play_angles(robot, number, speed, lift)
@@ -58,8 +59,10 @@ def _find_hidden_heading(robot: TurnedRobot) -> Iterator[RuleFinding]:
             if part > (MATTERS if lift else MATTERS_STANDING):
                 found.append(pair)
             if len(found) == CONFIRMED:
-                yield _hidden(robot, found[0], speed)
-                return
+                shown += [(pair, speed) for pair in found]
+                break
+    if shown:
+        yield _hidden(robot, *max(shown, key=lambda one: _compare(one[0])))
 
 
 def _hidden(robot: TurnedRobot, pair: tuple[TurnedStep, TurnedStep], speed: float) -> RuleFinding:
@@ -90,11 +93,15 @@ def _play_angles(robot: TurnedRobot, number: int, speed: float, lift: float) -> 
     pairs = _list_same(steps)
     if len(pairs) < FEWEST_SAME:
         return None
-    one, two = max(pairs, key=lambda pair: abs(pair[0].reward - pair[1].reward))
-    difference = abs(one.reward - two.reward)
+    one, two = max(pairs, key=_compare)
+    difference = _compare((one, two))
     change = max(difference, abs(steps[0].reward - back.reward))
     least = TINY * max(1.0, *(abs(step.reward) for step in steps))
     return (one, two), difference / change if change > least else 0.5 * MATTERS
+
+
+def _compare(pair: Pair) -> float:
+    return abs(pair[0].reward - pair[1].reward)
 
 
 def _list_same(steps: Sequence[TurnedStep]) -> list[tuple[TurnedStep, TurnedStep]]:

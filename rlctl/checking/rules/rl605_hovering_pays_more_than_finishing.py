@@ -40,9 +40,9 @@ LATE = 10  # steps after the recorded ones are assumed to earn the mean of the l
 
 NEAR_GOAL = "near the goal"
 """The fact of an `Income`."""
-FIRST_STEPS, RESTING_STEPS = 3, 12  # with the goal that reset drew, and then with one next to the robot
+FIRST_STEPS, RESTING_STEPS = 15, 12  # with the goal that reset drew, in which robots settle; and next to the robot
 OFFSETS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # of the goals' range: how far the goal is from the robot
-STILL = 0.1  # part of this distance that the robot may move
+STILL = 0.25  # part of this distance that the robot may move
 SHOWN = 3  # episodes that have to show it
 
 
