@@ -3,10 +3,12 @@
 import ast
 import contextlib
 import dataclasses
+import functools
 import inspect
 import math
 import sys
-from collections.abc import Iterator, Mapping
+import textwrap
+from collections.abc import Iterator
 from typing import Any
 
 from rlctl.checking.values import NUMBERS, find_author, list_own_classes
@@ -21,20 +23,28 @@ Place = tuple[str, int]
 
 @dataclasses.dataclass(frozen=True)
 class _Source:
-    """The code of one module, in which expressions are read."""
+    """The methods of an object, in which expressions are read."""
 
     author: Any
-    file: str
-    names: Mapping[str, Any]  # of the module
-    functions: list[ast.FunctionDef]
-    states: frozenset[str]  # attributes that other methods than the constructor assign
+    methods: list[tuple[str, ast.FunctionDef]]
+
+    @functools.cached_property
+    def states(self) -> frozenset[str]:
+        """The attributes that other methods than the constructor assign."""
+        return frozenset(
+            node.attr
+            for _, method in self.methods
+            if method.name != "__init__"
+            for node in ast.walk(method)
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+        )
 
     def list_entries(self) -> Iterator[tuple[str, list[Factor], Place]]:
         """Yield each value that gets a constant key in a dictionary, as its key, its factors and its place."""
-        for function in self.functions:
-            for node in ast.walk(function):
+        for file, method in self.methods:
+            for node in ast.walk(method):
                 for key, value in _read_entries(node):
-                    yield key, self.list_factors(value, function), (self.file, value.lineno)
+                    yield key, self.list_factors(value, method), (file, value.lineno)
 
     def list_factors(self, value: ast.expr, function: ast.FunctionDef, depth: int = 0) -> list[Factor]:
         """Return the factors of a product; of anything else, the value itself is the only one."""
@@ -58,7 +68,7 @@ class _Source:
             case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=[only]) if name in CONVERSIONS:
                 return follow(only)
             case ast.Call(func=ast.Attribute(value=ast.Name(id="self"), attr=name)):
-                method = next((one for one in self.functions if one.name == name), None)
+                method = next((one for _, one in self.methods if one.name == name), None)
                 returned = [node.value for node in ast.walk(method) if isinstance(node, ast.Return)] if method else []
                 return follow(returned[0], method) if method and len(returned) == 1 and returned[0] else [UNKNOWN]
             case ast.Name(id=name):
@@ -84,7 +94,8 @@ class _Source:
             case ast.Name(id="self"):
                 return self.author
             case ast.Name(id=name):
-                return self.names.get(name)
+                module = sys.modules[type(self.author).__module__]
+                return vars(module).get(name)
             case ast.Attribute(value=owner, attr=name):
                 found = self._look_up(owner)
                 return inspect.getattr_static(found, name, None) if found is not None else None
@@ -99,10 +110,8 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
     by known numbers other than 0, and the key has no other weight."""
     author = find_author(env)
     entries: dict[str, list[tuple[list[Factor], Place]]] = {}
-    for cls in list_own_classes(author):
-        with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
-            for key, factors, place in _read_source(cls, author).list_entries():
-                entries.setdefault(key, []).append((factors, place))
+    for key, factors, place in _Source(author, list_methods(author)).list_entries():
+        entries.setdefault(key, []).append((factors, place))
     held = {key: value for one in vars(author).values() if isinstance(one, dict) for key, value in one.items()}
     found = {}
     for key, listed in entries.items():
@@ -114,25 +123,22 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
     return found
 
 
-def list_functions(cls: type) -> tuple[str, list[ast.FunctionDef]]:
-    """Return the file of a class, and all functions that it has; raises `OSError`, `TypeError`, `SyntaxError` and
-    `ValueError` where it cannot be read."""
-    file = str(inspect.getsourcefile(cls))
-    with open(file, encoding="utf-8") as source:
-        tree = ast.parse(source.read())
-    return file, [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-
-
-def _read_source(cls: type, author: Any) -> _Source:
-    file, functions = list_functions(cls)
-    states = frozenset(
-        node.attr
-        for function in functions
-        if function.name != "__init__"
-        for node in ast.walk(function)
-        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
-    )
-    return _Source(author, file, vars(sys.modules[cls.__module__]), functions, states)
+def list_methods(author: Any) -> list[tuple[str, ast.FunctionDef]]:
+    """Return the methods that an object has of its own classes, each with its file; line numbers are those of the
+    file."""
+    methods: dict[str, Any] = {}
+    for cls in list_own_classes(author):
+        for name, member in vars(cls).items():
+            methods.setdefault(name, member.__func__ if isinstance(member, staticmethod | classmethod) else member)
+    found = []
+    for method in methods.values():
+        with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
+            lines, first = inspect.getsourcelines(method)
+            (node,) = ast.parse(textwrap.dedent("".join(lines))).body
+            if isinstance(node, ast.FunctionDef):
+                ast.increment_lineno(node, first - 1)
+                found.append((str(inspect.getsourcefile(method)), node))
+    return found
 
 
 def _read_entries(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
@@ -153,7 +159,7 @@ def _find_assigned(function: ast.FunctionDef, name: str) -> list[ast.expr]:
     """Return what a function assigns to a local name."""
     found = []
     for node in ast.walk(function):
-        targets = node.targets if isinstance(node, ast.Assign) else []
-        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
-            found.append(node.value)
+        if isinstance(node, ast.Assign):
+            is_own = any(isinstance(target, ast.Name) and target.id == name for target in node.targets)
+            found += [node.value] if is_own else []
     return found

@@ -82,10 +82,12 @@ def _play_angles(robot: TurnedRobot, number: int, speed: float, lift: float) -> 
     """Return two steps of moving forwards at headings with the same observation, and how far their rewards differ,
     as part of what moving backwards changes; None if the observation differs at nearly all headings."""
     back = robot.play(number, ANGLES[0], -speed, lift)
+    if back is None:
+        return None
     steps: list[TurnedStep] = []
     for angle in ANGLES:
         step = robot.play(number, angle, speed, lift)
-        if step is None or back is None:
+        if step is None:
             return None
         steps.append(step)
         if len(steps) == ENOUGH and not _list_same(steps):

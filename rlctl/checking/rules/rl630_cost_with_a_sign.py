@@ -1,7 +1,6 @@
 """RL630: cost with a sign."""
 
 import ast
-import contextlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -13,9 +12,9 @@ from rlctl.checking.records import CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rewards import RAW_TERMS, TERMS, WITH_SEARCH, find_terms, has_terms, require_rewarded
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.term_names import is_about_actions, is_cost, is_error, split_name
-from rlctl.checking.term_weights import list_functions
+from rlctl.checking.term_weights import list_methods
 from rlctl.checking.transitions import find_float_leaves
-from rlctl.checking.values import find_author, list_own_classes
+from rlctl.checking.values import find_author
 from rlctl.checking.worlds import Array
 
 RULE = Rule(
@@ -110,14 +109,11 @@ def _find_signed_sums(shown: ActionTrials) -> Iterator[ChildMessage]:
     """Yield the first line that subtracts the plain sum of an action, whose elements may be negative."""
     if not all(min(dimension.bounds) < 0 < max(dimension.bounds) for dimension in shown.dimensions):
         return
-    author = find_author(shown.trials.instance.env)
-    for cls in list_own_classes(author):
-        with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
-            file, functions = list_functions(cls)
-            for line in sorted(line for function in functions for line in _list_subtractions(function)):
-                message = "the plain sum of the action is subtracted from the reward: negative actions are paid"
-                yield RuleFinding(RULE, message, {"element": "the reward"}, where=(file, line))
-                return
+    for file, method in list_methods(find_author(shown.trials.instance.env)):
+        for line in sorted(_list_subtractions(method)):
+            message = "the plain sum of the action is subtracted from the reward: negative actions are paid"
+            yield RuleFinding(RULE, message, {"element": "the reward"}, where=(file, line))
+            return
 
 
 def _list_subtractions(function: ast.FunctionDef) -> Iterator[int]:

@@ -9,7 +9,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
-from rlctl.checking.step_times import find_rates, find_step_times
+from rlctl.checking.step_times import find_declared, find_rates
 
 RULE = Rule(
     "RL832",
@@ -32,20 +32,28 @@ def _find_wrong_integration(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
     if np.isfinite(log.physics_s):
         raise NotApplicable("an engine integrates")
-    times = find_step_times(log)
-    if times is None:
+    declared = find_declared(log)
+    if declared is None:
         raise NotApplicable("no step has several substeps, as far as it is known")
     rates = find_rates(log, log.values)
-    if not any(math.isclose(seconds, times.control_s, rel_tol=NEAR) for _, _, seconds in rates):
-        return
-    for column, rate, seconds in rates:
-        factor = seconds / times.control_s
-        if any(math.isclose(factor, wrong, rel_tol=NEAR) for wrong in (times.substeps, 1 / times.substeps)):
-            name, speed = log.names[column], log.names[rate]
-            wrong_s = times.control_s if factor > 1 else times.physics_s
-            message = (
-                f"{name} changes in a step by {speed} times {seconds:.3g} s, {factor:.3g} times the"
-                f" {times.control_s:.4g} s that a step takes ({times.source}): it is integrated with {wrong_s:.4g} s"
-            )
-            yield RuleFinding(RULE, message, {"element": name, "value": seconds, "expected": times.control_s})
-            return
+    for name, declared_s in declared.times.items():
+        for control_s in (declared_s, declared_s * declared.substeps):
+            right = [pair for pair in rates if math.isclose(pair[2], control_s, rel_tol=NEAR)]
+            for factor in (declared.substeps, 1 / declared.substeps) if right else ():
+                wrong = [pair for pair in rates if math.isclose(pair[2], factor * control_s, rel_tol=NEAR)]
+                if wrong and len(wrong) <= len(right):
+                    yield _describe(
+                        log, wrong[0], right[0], f"{name} is {declared_s:.3g} s, {declared.count} {declared.substeps}"
+                    )
+                    return
+
+
+def _describe(
+    log: AttributeLog, wrong: tuple[int, int, float], right: tuple[int, int, float], declared: str
+) -> RuleFinding:
+    one, two = (
+        f"{log.names[column]} changes by {log.names[rate]} times {seconds:.3g} s"
+        for column, rate, seconds in (wrong, right)
+    )
+    message = f"in a step {one}, and {two}: {declared}"
+    return RuleFinding(RULE, message, {"element": log.names[wrong[0]], "value": wrong[2], "expected": right[2]})
