@@ -1,4 +1,4 @@
-"""RL630: costs with signs; RL831 and RL832: steps that take another time than is declared; RL830: orders of contacts."""
+"""RL630: costs with signs; RL831, RL832: steps of another time than is declared; RL830: contacts in another order."""
 
 import pytest
 
