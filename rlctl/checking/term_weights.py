@@ -22,7 +22,7 @@ Place = tuple[str, int]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Source:
+class _TermSource:
     """The methods of an object, in which expressions are read."""
 
     author: Any
@@ -110,7 +110,7 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
     by known numbers other than 0, and the key has no other weight."""
     author = find_author(env)
     entries: dict[str, list[tuple[list[Factor], Place]]] = {}
-    for key, factors, place in _Source(author, list_methods(author)).list_entries():
+    for key, factors, place in _TermSource(author, list_methods(author)).list_entries():
         entries.setdefault(key, []).append((factors, place))
     held = {key: value for one in vars(author).values() if isinstance(one, dict) for key, value in one.items()}
     found = {}
