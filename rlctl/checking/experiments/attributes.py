@@ -40,7 +40,7 @@ from rlctl.environments.info import find_mujoco
 
 EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
 """How the actions of each episode are chosen; with none for robots only whose reward has terms about steps."""
-STEPS, ZERO_STEPS = 30, 100  # of an episode; of one in which a robot comes to stand
+STEPS, ZERO_STEPS = 30, 200  # of an episode; of one in which a robot comes to stand
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
 WEIGHED_TERMS = "weighed terms"
@@ -84,7 +84,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     instance = context.instance
     clients = instance.find_clients()
     with record_calls(with_results=()) if "pybullet" in sys.modules else contextlib.nullcontext(BulletCalls()) as calls:
-        looks: list[_Look] = []
+        looks: list[_LoggedLook] = []
         for number, kind in enumerate(EPISODES):
             if kind == "zero" and not any(is_about_steps(name) for name in looks[-1].infos):
                 break
@@ -101,7 +101,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
 
 
 @dataclasses.dataclass
-class _Look:
+class _LoggedLook:
     episode: int
     attributes: dict[str, Numbers]
     observed: Numbers
@@ -119,7 +119,7 @@ def _play(
     number: int,
     kind: str,
     names: Collection[str] | None,
-) -> Iterator[_Look]:
+) -> Iterator[_LoggedLook]:
     """Play an episode; `names` are the attributes that changed in an earlier one."""
     watched: list[Attribute] = []
     engine = _Engine()
@@ -131,7 +131,7 @@ def _play(
             engine = _Engine.find(instance, clients)
         if not moment.is_readable:
             return
-        yield _Look(
+        yield _LoggedLook(
             number,
             {one.name: _read(one) for one in watched},
             flatten_floats(instance.leaves, moment.observation),
@@ -196,7 +196,7 @@ class _Engine:
         return np.concatenate([np.zeros(0), *parts])
 
 
-def _join(instance: Instance, clients: Sequence[int], looks: list[_Look]) -> AttributeLog | None:
+def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) -> AttributeLog | None:
     if len({(look.observed.shape, look.speeds.shape) for look in looks}) != 1:
         return None
     sizes = {name: {look.attributes[name].size for look in looks if name in look.attributes} for name in _names(looks)}
@@ -226,7 +226,7 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_Look]) -> Att
     )
 
 
-def _names(looks: list[_Look]) -> list[str]:
+def _names(looks: list[_LoggedLook]) -> list[str]:
     return list(dict.fromkeys(name for look in looks for name in look.attributes))
 
 

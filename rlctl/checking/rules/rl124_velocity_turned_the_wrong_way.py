@@ -139,4 +139,4 @@ def _fits(block: Array, vectors: _Vectors, values: Array) -> bool:
 def _is_noise(block: Array, rest: Array) -> bool:
     moving = block - block.mean(axis=0)
     size = float(np.square(moving).sum())
-    return size > 0 and float(np.square(rest).sum()) < NOISY * size and all(is_white(column) for column in rest.T)
+    return size > 0 and float(np.square(rest).sum()) < NOISY * size and is_white(rest.T.ravel())

@@ -142,3 +142,13 @@ def test_success_that_ends_an_income_is_named_where_nobody_shows_what_is_wanted(
     assert f"; {sentence} and earns 85" in judge(trembling, nothing).why_alone
     cheap = dataclasses.replace(nothing, reward=25.0, discounted=13.0)
     assert "success does not pay" not in judge(trembling, cheap).why_alone
+
+
+def test_terms_for_steps_that_pay_one_who_stands_are_named():
+    # 40 in 100 steps against 100 in 200 steps: 0.4 of 0.5 in each step. What feet in contact earn is no such term.
+    following = episode(FOLLOWING, {"feet_clearance": 100.0, "feet_contact": 50.0}, success=True, steps=200)
+    standing = episode(STANDING, {"feet_clearance": 40.0, "feet_contact": 50.0})
+    (sentence,) = judge(following, standing).paid_still
+    what = "feet_clearance pays standing still 80 % of what it pays following the command"
+    assert sentence == f"{what}: it should pay nothing then"
+    assert not judge(following, episode(STANDING, {"feet_clearance": 5.0, "feet_contact": 50.0})).paid_still
