@@ -48,6 +48,29 @@ def _read_engine(log: AttributeLog) -> StepTimes | None:
 
 def _read_declared(log: AttributeLog) -> StepTimes | None:
     """Return the two times of which what is declared says one, and how positions follow velocities shows which."""
+    declared = find_declared(log)
+    shown = estimate_step(log) if declared is not None else None
+    if declared is None or shown is None:
+        return None
+    for name, value in declared.times.items():
+        for control_s in (value, value * declared.substeps):
+            # The other one is at least twice as long.
+            if abs(shown / control_s - 1) < NEAR:
+                return StepTimes(control_s, control_s / declared.substeps, f"{name} and {declared.count}")
+    return None
+
+
+@dataclasses.dataclass(frozen=True)
+class DeclaredTimes:
+    """What a robot without an engine declares."""
+
+    count: str  # The name of the number of substeps
+    substeps: int
+    times: dict[str, float]  # of a step or of a substep, by name [s]
+
+
+def find_declared(log: AttributeLog) -> DeclaredTimes | None:
+    """Return the declared number of substeps, and times; None where there are none, or several numbers."""
     named = {
         name: round(value)
         for name, value in log.declared.items()
@@ -59,16 +82,8 @@ def _read_declared(log: AttributeLog) -> StepTimes | None:
     times |= {name: 1 / log.declared[name] for name in RATES if log.declared.get(name, 0) > 1}
     if len(set(counts.values())) != 1 or not times:
         return None
-    (substeps,) = set(counts.values())
-    shown = estimate_step(log)
-    if shown is None:
-        return None
-    for name, value in times.items():
-        for control_s in (value, value * substeps):
-            # The other one is at least twice as long.
-            if abs(shown / control_s - 1) < NEAR:
-                return StepTimes(control_s, control_s / substeps, f"{name} and {next(iter(counts))}")
-    return None
+    count, substeps = next(iter(counts.items()))
+    return DeclaredTimes(count, substeps, times)
 
 
 def words_of(name: str) -> list[str]:

@@ -92,6 +92,12 @@ def find_author(env: Any) -> Any:
     return env.unwrapped.task
 
 
+def list_own_classes(author: Any) -> list[type]:
+    """Return the classes of an object that no library has."""
+    known = (*LIBRARIES, "typing", "abc")
+    return [cls for cls in type(author).__mro__ if cls.__module__.partition(".")[0] not in known]
+
+
 def find_batch(env: Any) -> Any:
     """Return the `BatchTask` of an environment; None for any other."""
     batches = sys.modules.get("rlctl.task.batch")

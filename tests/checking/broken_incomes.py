@@ -3,6 +3,7 @@ for all the steps that are left."""
 
 import numpy as np
 from broken_meaning import Rover
+from broken_progress import CartSeeks, PuckSeeks
 from broken_reach_bullet import Reacher
 from mujoco_robots import MujocoArm
 
@@ -56,3 +57,58 @@ class RL605ReacherEndsIncome(EndsIncome, Reacher):
 
 
 class ReacherPaysAll(PaysAll, RL605ReacherEndsIncome): ...
+
+
+class RL605RoverRestsNear(RL605RoverEndsIncome):
+    """Its goals are too small for random actions."""
+
+    near, bonus = 0.04, 5.0
+
+
+class RoverFindsLittle(PaysAll, RL605RoverRestsNear):
+    bonus = 100.0
+
+
+class RL605ArmRestsNear(RL605ArmEndsIncome):
+    bonus = 5.0
+
+    def succeeds(self):
+        return self.distance() < 0.015
+
+
+class ArmFindsLittle(PaysAll, RL605ArmRestsNear):
+    bonus = 100.0
+
+
+class PuckFindsLittle(PuckSeeks):
+    """It is paid the way by which it comes nearer, and a success ends its episode."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        success = info["is_success"]
+        return observation, reward + 5.0 * success, success, truncated and not success, info
+
+    def succeeds(self):
+        return self.distance() < 0.03
+
+
+class RL605PuckCountsFromTheStart(PuckFindsLittle):
+    """The distance before is always the one at the start."""
+
+    def reward(self, *_):
+        return 5.0 * self.progress(self.last, self.distance())
+
+
+class CartFindsLittle(CartSeeks):
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        success = info["is_success"]
+        return observation, reward + 5.0 * success, success, truncated and not success, info
+
+    def succeeds(self):
+        return self.distance() < 0.03
+
+
+class RL605CartCountsFromTheStart(CartFindsLittle):
+    def reward(self, *_):
+        return 5.0 * self.progress(self.last, self.distance())

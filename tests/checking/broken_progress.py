@@ -3,9 +3,11 @@ Others pay for success, or take something for it."""
 
 import numpy as np
 import pybullet as p
+from broken_reach_bullet import Reacher
 from broken_turned import Cart, Flyer, Puck
 from mujoco_robots import MujocoArm, MujocoHopper
 from robots import Boat
+from scipy.spatial.transform import Rotation
 
 
 class Seeks:
@@ -171,3 +173,33 @@ class PuckPaysSuccess(PaysSuccess, PuckSeeks): ...
 
 
 class RL622PuckCostsSuccess(CostsSuccess, PuckSeeks): ...
+
+
+class ArmSeesFromHand(MujocoArm):
+    """It sees the way to the goal in the frame of its hand."""
+
+    def seen(self, way):
+        return self.data.body("hand").xmat.reshape(3, 3).T @ way
+
+    def observe(self):
+        return np.concatenate([self.data.qpos, self.data.qvel, self.seen(self.goal - self.tip())])
+
+
+class RL125ArmHandTurnsBack(ArmSeesFromHand):
+    def seen(self, way):
+        return self.data.body("hand").xmat.reshape(3, 3) @ way
+
+
+class ReacherSeesFromHand(Reacher):
+    """The same in PyBullet."""
+
+    def turn(self):
+        return Rotation.from_quat(self.hand()[5]).inv()
+
+    def to_goal(self):
+        return self.turn().apply(super().to_goal())
+
+
+class RL125ReacherHandTurnsBack(ReacherSeesFromHand):
+    def turn(self):
+        return super().turn().inv()

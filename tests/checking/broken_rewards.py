@@ -194,6 +194,32 @@ class RL620ActionWithItself(RL620Smooth):
         self.last = self.action
 
 
+class RL620WeightInAnAttribute(RL620ActionWithItself):
+    weights = {"rate": 0.2}
+
+    def terms(self):
+        change = float(np.square(self.action - self.last).sum())
+        terms = super().terms()
+        terms["smoothness"] = -self.weights["rate"] * change
+        return terms
+
+
+class RL620WeightInAMethod(RL620ActionWithItself):
+    weight = 0.3
+
+    def change(self):
+        return -self.weight * np.square(self.action - self.last).sum()
+
+    def terms(self):
+        return {**super().terms(), "smoothness": float(self.change())}
+
+
+class RL620WeightOfZero(RL620WeightInAMethod):
+    """It may be meant to cost nothing."""
+
+    weight = 0.0
+
+
 class RL621EffortPays(Terms):
     """The minus is there twice."""
 

@@ -294,3 +294,55 @@ class RL124PuckWrongWay(Puck):
     def observe(self):
         turn, velocity, turning = self.look()
         return np.concatenate([turn.apply(velocity), turn.inv().apply(turning)]).astype(np.float32)
+
+
+class Follows:
+    """It is paid for a velocity that is drawn, in its own frame, and only where it nearly has that."""
+
+    wanted = np.zeros(2)
+
+    def start(self):
+        super().start()
+        self.wanted = self.np_random.uniform(-0.3, 0.3, 2)
+
+    def observe(self):
+        return np.append(super().observe(), self.wanted).astype(np.float32)
+
+    def velocity(self):
+        return self.turn().inv().apply(self.data.qvel[:3])[:2]
+
+    def reward(self):
+        return np.exp(-np.square(self.velocity() - self.wanted).sum() / 0.02)
+
+
+class FollowsNorth(Follows):
+    """The velocity is the one in the world."""
+
+    def velocity(self):
+        return self.data.qvel[:2]
+
+
+class FlyerFollows(Follows, Flyer): ...
+
+
+class RL123FlyerFollowsNorth(FollowsNorth, Flyer): ...
+
+
+class CartFollows(Follows, Cart): ...
+
+
+class RL123CartFollowsNorth(FollowsNorth, Cart): ...
+
+
+class PuckFollows(Follows, Puck):
+    def size(self):
+        return super().size() + 2
+
+    def velocity(self):
+        turn, velocity, _ = self.look()
+        return turn.inv().apply(velocity)[:2]
+
+
+class RL123PuckFollowsNorth(PuckFollows):
+    def velocity(self):
+        return self.look()[1][:2]

@@ -121,3 +121,15 @@ class RL012OtherSpaces(Reach):
     def observe(self):
         parts = super().observe()
         return parts if self.see_goal else {name: parts[name] for name in ("joint_positions", "hand_to_goal")}
+
+
+@dataclass
+class RL014ActsInTime(Reach):
+    """Its event acts twice in an episode; nothing is wrong with it."""
+
+    events = {"gust": Event("interval", events.push, every_s=1.0, body="arm", force=(0.0, 1.0))}
+
+
+@dataclass
+class RL014ActsTooLate(Reach):
+    events = {"gust": Event("interval", events.push, every_s=30.0, body="arm", force=(0.0, 1.0))}

@@ -20,7 +20,7 @@ CASES = [
     case(f"{FILE}:RL705ChangesAction", ("RL705", "warning"), slow=True),
     case(f"{FILE}:RL705ChangesPartOfAction", ("RL705", "warning"), slow=True),
     case("broken_robots.py:RL701ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
-    case("broken_robots.py:RL701BoatForwardOnly", ("RL701", "info"), twin="robots.py:Boat"),
+    case("broken_robots.py:RL701BoatForwardOnly", ("RL701", "warning"), twin="robots.py:Boat"),
 ]
 CASES += [
     case(f"broken_maps.py:RL707{robot}FallsBack", ("RL707", "warning"), twin=twin, pybullet=True, slow=robot != "Rover")

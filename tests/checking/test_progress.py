@@ -28,6 +28,8 @@ CASES = [
     broken("RL125FlyerTurnsBack", "FlyerSeeks", slow=True),
     broken("RL125HopperTurnsBack", "HopperSeeks", slow=True),
     broken("RL125PuckTurnsBack", "PuckSeeks", pybullet=True, slow=True),
+    broken("RL125ArmHandTurnsBack", "ArmSeesFromHand", slow=True),
+    broken("RL125ReacherHandTurnsBack", "ReacherSeesFromHand", pybullet=True, slow=True),
 ]
 
 

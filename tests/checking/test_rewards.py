@@ -47,7 +47,10 @@ CASES = [
     broken("RL610SuccessAtStart", ("RL610", "warning"), twin="RL610SuccessOnAverage"),
     broken("RL611SuccessNever", ("RL611", "info"), slow=True),
     broken("RL612WrongSlice", ("RL612", "warning"), twin="RL612TimePenalty", slow=True),
-    broken("RL620ActionWithItself", ("RL620", "info"), twin="RL620Smooth", slow=True),
+    broken("RL620ActionWithItself", ("RL620", "warning"), twin="RL620Smooth", slow=True),
+    broken("RL620WeightInAnAttribute", ("RL620", "warning"), twin="RL620Smooth", slow=True),
+    broken("RL620WeightInAMethod", ("RL620", "warning"), twin="RL620Smooth", slow=True),
+    broken("RL620WeightOfZero", ("RL620", "info"), twin="RL620Smooth", slow=True),
     broken("RL621EffortPays", ("RL621", "warning"), twin="Terms", slow=True),
     broken("RL621CalledPenalty", ("RL621", "info"), twin="RL621LowersTheReward", slow=True),
     case(

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import inspect
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,22 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
+from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.term_names import is_about_steps
+from rlctl.checking.term_weights import find_weighed_terms
 from rlctl.checking.transitions import flatten_floats
-from rlctl.checking.values import NUMBERS, Attribute, find_author, find_numbers, flatten_action, read_attributes
+from rlctl.checking.values import (
+    NUMBERS,
+    Attribute,
+    find_author,
+    find_numbers,
+    flatten_action,
+    list_own_classes,
+    read_attributes,
+)
 from rlctl.checking.worlds import JOINTS, World
-from rlctl.environments.bullet_calls import LIBRARIES, BulletCalls, record_calls
+from rlctl.environments.bullet_calls import BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
@@ -33,6 +43,8 @@ EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
 STEPS, ZERO_STEPS = 30, 200  # of an episode; of one in which a robot comes to stand
 FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
+WEIGHED_TERMS = "weighed terms"
+"""The fact with what `find_weighed_terms` returns."""
 RATES = ("render_fps", "video.frames_per_second")
 """Where metadata has the frame rate [Hz]."""
 Numbers = NDArray[np.float64]
@@ -76,13 +88,16 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
         for number, kind in enumerate(EPISODES):
             if kind == "zero" and not any(is_about_steps(name) for name in looks[-1].infos):
                 break
-            looks += _play(instance, clients, calls, number, kind)
+            names = set(looks[-1].attributes) if looks else None
+            looks += _play(instance, clients, calls, number, kind, names)
             if context.budget.is_over():
                 break
     log = _join(instance, clients, looks)
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
+    if any(name.startswith(TERMS) for name in log.infos):
+        yield Fact(WEIGHED_TERMS, find_weighed_terms(instance.env))
 
 
 @dataclasses.dataclass
@@ -98,14 +113,21 @@ class _LoggedLook:
 
 
 def _play(
-    instance: Instance, clients: Sequence[int], calls: BulletCalls, number: int, kind: str
+    instance: Instance,
+    clients: Sequence[int],
+    calls: BulletCalls,
+    number: int,
+    kind: str,
+    names: Collection[str] | None,
 ) -> Iterator[_LoggedLook]:
+    """Play an episode; `names` are the attributes that changed in an earlier one."""
     watched: list[Attribute] = []
     engine = _Engine()
     longest = ZERO_STEPS if kind == "zero" else STEPS
     for moment in EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=longest):
         if moment.step == 0:
-            watched = [one for one in read_attributes(instance.env).values() if one.numbers.size]
+            every = read_attributes(instance.env).values()
+            watched = [one for one in every if one.numbers.size and (names is None or one.name in names)]
             engine = _Engine.find(instance, clients)
         if not moment.is_readable:
             return
@@ -119,7 +141,7 @@ def _play(
             engine.read_speeds(),
             engine.read_seconds(calls),
         )
-        if moment.step == FEW_STEPS:
+        if moment.step == FEW_STEPS and names is None:
             after = [_read(one) for one in watched]
             watched = [
                 one for one, now in zip(watched, after, strict=True) if not np.array_equal(one.numbers, now)
@@ -212,7 +234,7 @@ def _find_declared(env: Any) -> dict[str, float]:
     """Return the numbers of the author's object, of its classes, and of the modules of these, by name."""
     author = find_author(env)
     found: dict[str, float] = {}
-    for cls in reversed(_own_classes(author)):
+    for cls in reversed(list_own_classes(author)):
         spaces = [vars(sys.modules.get(cls.__module__, cls)), vars(cls)]
         found |= {name: float(value) for space in spaces for name, value in space.items() if _is_number(value)}
     metadata = getattr(author, "metadata", None)
@@ -226,16 +248,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_)
 
 
-def _own_classes(author: Any) -> list[type]:
-    return [
-        cls for cls in type(author).__mro__ if cls.__module__.partition(".")[0] not in (*LIBRARIES, "typing", "abc")
-    ]
-
-
 def _find_literals(env: Any) -> set[float]:
     """Return the numbers that the source of its classes' modules has."""
     found: set[float] = set()
-    for file in {inspect.getsourcefile(cls) for cls in _own_classes(find_author(env))}:
+    for file in {inspect.getsourcefile(cls) for cls in list_own_classes(find_author(env))}:
         with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
             with open(str(file), encoding="utf-8") as source:
                 values = [node.value for node in ast.walk(ast.parse(source.read())) if isinstance(node, ast.Constant)]

@@ -5,7 +5,7 @@ Nothing but its heading is another one then: on level ground the robot moves as 
 
 import dataclasses
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,10 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
+from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats
+from rlctl.checking.values import find_numbers
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 from rlctl.task.rotations import from_axis, multiply, roll_pitch_yaw, rotate
@@ -36,6 +38,7 @@ class TurnedStep:
     heading: float  # of the robot before it, from the engine [rad]
     observed: Numbers  # The numbers that are floats. Shape (elements,)
     reward: float  # NaN where it is no number
+    terms: Mapping[str, float]  # of the reward, by name; empty where info has none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,17 +47,19 @@ class TurnedRobot:
 
     instance: Instance
 
-    def play(self, number: int, angle: float, speed: float = 0.0) -> TurnedStep | None:
-        """Reset with a seed, turn the robot by an angle [rad] about the vertical, let it move forwards at a speed
-        [m/s], and take a step; None where time is over."""
+    def play(self, number: int, angle: float, speed: float = 0.0, lift: float = 0.0) -> TurnedStep | None:
+        """Reset with a seed, turn the robot by an angle [rad] about the vertical, lift it [m], let it move forwards at
+        a speed [m/s], and take a step; None where time is over."""
         if self.instance.context.budget.is_over():
             return None
         player = EpisodePlayer(self.instance, FIRST_SEED + number, "zero", max_steps=1)
         player.reset()
-        heading = _turn(self.instance, angle, speed)
+        heading = _turn(self.instance, angle, speed, lift)
         moment = player.step()
         observed = flatten_floats(self.instance.leaves, moment.observation)
-        return TurnedStep(heading, observed, moment.reward_number)
+        numbers = find_numbers(moment.info) if isinstance(moment.info, dict) else ()
+        terms = {name.removeprefix(TERMS): value for name, value in numbers if name.startswith(TERMS)}
+        return TurnedStep(heading, observed, moment.reward_number, terms)
 
 
 judges_turned = JudgeHook[TurnedRobot]()
@@ -116,29 +121,30 @@ def _is_level_plane(p: ClientCalls, body: int) -> bool:
     return bool(high[0] - low[0] > ENDLESS and rotate(orientation, UP)[2] > 1 - 1e-9)
 
 
-def _turn(instance: Instance, angle: float, speed: float) -> float:
-    """Turn the free robot about the vertical, and set its velocity; return its heading [rad]."""
+def _turn(instance: Instance, angle: float, speed: float, lift: float) -> float:
+    """Turn the free robot about the vertical, lift it, and set its velocity; return its heading [rad]."""
     if (simulation := find_mujoco(instance.env)) is not None:
-        return _turn_in_mujoco(*simulation, angle, speed)
+        return _turn_in_mujoco(*simulation, angle, speed, lift)
     (p, body), *_ = _find_free_bodies(instance.find_clients())
     place, orientation = p.getBasePositionAndOrientation(body)
     linear, angular = p.getBaseVelocity(body)
     turn = from_axis(UP, angle)
     turned = multiply(turn, np.array(orientation))
     heading = roll_pitch_yaw(turned.tolist())[2]
-    p.resetBasePositionAndOrientation(body, place, turned.tolist())
+    p.resetBasePositionAndOrientation(body, (*place[:2], place[2] + lift), turned.tolist())
     velocity = rotate(turn, linear) + speed * np.array([np.cos(heading), np.sin(heading), 0.0])
     p.resetBaseVelocity(body, velocity.tolist(), rotate(turn, angular).tolist())
     return float(heading)
 
 
-def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float) -> float:
+def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float, lift: float) -> float:
     (joint,) = np.flatnonzero(model.jnt_type == FREE)
     place, first = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
     turn = from_axis(UP, angle)
     turned = multiply(turn, np.roll(data.qpos[place + 3 : place + 7], -1))
     heading = roll_pitch_yaw(turned.tolist())[2]
     data.qpos[place + 3 : place + 7] = np.roll(turned, 1)
+    data.qpos[place + 2] += lift
     data.qvel[first : first + 3] = rotate(turn, data.qvel[first : first + 3])
     data.qvel[first : first + 2] += speed * np.array([np.cos(heading), np.sin(heading)])
     sys.modules["mujoco"].mj_forward(model, data)

@@ -20,10 +20,13 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         An event of a task draws numbers and reports them, but changes nothing with them: what it calls in the world
-        is the same for other numbers, and so is an episode with its ranges at both ends. The policy is trained
-        without this randomisation.
+        is the same for other numbers, and so is an episode with its ranges at both ends. Or its interval is longer than
+        an episode, so that it never acts. The policy is trained without this randomisation.
     """,
-    fix="Apply what the event's function draws, such as sim.body('arm').scale_mass(drawn).",
+    fix="""
+        Apply what the event's function draws, such as sim.body('arm').scale_mass(drawn); let every_s be a part of
+        episode_s.
+    """,
 )
 
 MOMENTS = ("reset", "start", "interval")  # of events that change the world
@@ -85,6 +88,7 @@ def _find_idle_events(variants: TaskVariants) -> Iterator[ChildMessage]:
     if not variants.task.events:
         yield Skipped(RULE.id, "the task has no events", applies=False)
         return
+    yield from _find_late_events(variants)
     if not variants.repeats:
         yield Skipped(RULE.id, "equal seeds and actions give unequal episodes (RL3)")
         return
@@ -101,6 +105,18 @@ def _find_idle_events(variants: TaskVariants) -> Iterator[ChildMessage]:
                 yield RuleFinding(RULE, message, {"element": f"events.{name}"})
     except EnvironmentRaised:  # RL011 plays all events
         yield Skipped(RULE.id, "an event raises (RL011)")
+
+
+def _find_late_events(variants: TaskVariants) -> Iterator[RuleFinding]:
+    """Yield the events at an interval that is longer than an episode."""
+    episode_s = variants.task.episode_s
+    for name, event in variants.task.events.items():
+        changed = variants.context.spec.events.get(name)
+        every_s = changed.get("every_s", event.every_s) if isinstance(changed, Mapping) else event.every_s
+        if event.when == "interval" and every_s >= episode_s:
+            message = f"event {name!r} acts every {every_s:g} s, and an episode lasts {episode_s:g} s: it never acts"
+            evidence = {"element": f"events.{name}", "value": every_s, "expected": f"below {episode_s:g}"}
+            yield RuleFinding(RULE, message, evidence)
 
 
 def _is_idle(name: str, event: Event, sim: Any) -> bool:

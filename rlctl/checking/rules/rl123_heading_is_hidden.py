@@ -25,53 +25,85 @@ RULE = Rule(
     """,
 )
 
-SPEED = 0.5  # forwards [m/s]
+WAYS = ((0.5, 0.1), (0.15, 0.1), (0.5, 0.0))
+"""Speeds forwards [m/s], and how far the robot is lifted [m]: in the air no friction changes with the direction. A
+reward that falls steeply with an error is nothing at the wrong speed."""
 ANGLES = (0.0, 1.3, 2.6, 3.9, 5.2)  # [rad]
-EPISODES = 2
+EPISODES, CONFIRMED = 5, 2  # that are played at most, and that have to show it: some commands are nearly 0
 ENOUGH, FEWEST_SAME = 4, 2  # headings after which something must be the same; pairs of all that must be
 SAME = 0.02  # part of an element's size, or of 1: friction differs a little with the direction
-MATTERS = 0.5  # part of what the direction of the movement changes in the reward
+MATTERS, NOTHING = 0.25, 0.01  # parts of what the direction of the movement changes in the reward: matters; does not
+MATTERS_STANDING = 0.5
 TINY = 1e-4  # what moving changes in a reward that does not depend on it
 STARTS, VARIED = 6, 0.5  # resets, and how far their headings are apart [rad]
+Pair = tuple[TurnedStep, TurnedStep]
 
 
 @judges_turned(RULE)
 def _find_hidden_heading(robot: TurnedRobot) -> Iterator[RuleFinding]:
     """Yield a finding where turning changes the reward as moving does, and nothing of the observation."""
-    ranges = []
-    for number in range(EPISODES):
-        rewards = _play_angles(robot, number)
-        if rewards is None:
-            return
-        ranges.append(rewards)
+    is_sound = False
+    shown: list[tuple[Pair, float]] = []
+    for speed, lift in WAYS:
+        if (is_sound or shown) and not lift:
+            break
+        found: list[Pair] = []
+        for number in range(EPISODES):
+            played = _play_angles(robot, number, speed, lift)
+            if played is None:
+                return
+            pair, part = played
+            if part < NOTHING:
+                is_sound = True
+                break
+            if part > (MATTERS if lift else MATTERS_STANDING):
+                found.append(pair)
+            if len(found) == CONFIRMED:
+                shown += [(pair, speed) for pair in found]
+                break
+    if shown:
+        yield _hidden(robot, *max(shown, key=lambda one: _compare(one[0])))
+
+
+def _hidden(robot: TurnedRobot, pair: tuple[TurnedStep, TurnedStep], speed: float) -> RuleFinding:
     starts = [robot.play(number, 0.0) for number in range(STARTS)]
     severity = Severity.WARNING if _is_varied([start for start in starts if start is not None]) else Severity.INFO
-    low, high = ranges[0]
+    low, high = sorted(step.reward for step in pair)
     what = f"turned about the vertical, the robot observes the same and gets rewards from {low:.4g} to {high:.4g}"
-    message = f"{what} for moving forwards at {SPEED:g} m/s"
-    yield RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": high - low, "expected": 0.0}, severity)
+    message = f"{what} for moving forwards at {speed:g} m/s"
+    one, two = (step.terms for step in pair)
+    if shared := one.keys() & two.keys():
+        term = max(shared, key=lambda name: abs(one[name] - two[name]))
+        message += f"; term {term!r} is from {min(one[term], two[term]):.4g} to {max(one[term], two[term]):.4g}"
+    return RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": high - low, "expected": 0.0}, severity)
 
 
-def _play_angles(robot: TurnedRobot, number: int) -> tuple[float, float] | None:
-    """Return two rewards for moving forwards at headings with the same observation; None if it differs at nearly all
-    headings, or the rewards do not."""
+def _play_angles(robot: TurnedRobot, number: int, speed: float, lift: float) -> tuple[Pair, float] | None:
+    """Return two steps of moving forwards at headings with the same observation, and how far their rewards differ,
+    as part of what moving backwards changes; None if the observation differs at nearly all headings."""
+    back = robot.play(number, ANGLES[0], -speed, lift)
+    if back is None:
+        return None
     steps: list[TurnedStep] = []
-    changes: list[float] = []
     for angle in ANGLES:
-        step, back = (robot.play(number, angle, speed) for speed in (SPEED, -SPEED))
-        if step is None or back is None:
+        step = robot.play(number, angle, speed, lift)
+        if step is None:
             return None
         steps.append(step)
-        changes.append(abs(step.reward - back.reward))
         if len(steps) == ENOUGH and not _list_same(steps):
             return None
-    change, pairs = max(changes), _list_same(steps)
-    if len(pairs) < FEWEST_SAME or not change > TINY * max(1.0, *(abs(step.reward) for step in steps)):
+    pairs = _list_same(steps)
+    if len(pairs) < FEWEST_SAME:
         return None
-    one, two = max(pairs, key=lambda pair: abs(pair[0].reward - pair[1].reward))
-    if not abs(one.reward - two.reward) > MATTERS * change:
-        return None
-    return min(one.reward, two.reward), max(one.reward, two.reward)
+    one, two = max(pairs, key=_compare)
+    difference = _compare((one, two))
+    change = max(difference, abs(steps[0].reward - back.reward))
+    least = TINY * max(1.0, *(abs(step.reward) for step in steps))
+    return (one, two), difference / change if change > least else 0.5 * MATTERS
+
+
+def _compare(pair: Pair) -> float:
+    return abs(pair[0].reward - pair[1].reward)
 
 
 def _list_same(steps: Sequence[TurnedStep]) -> list[tuple[TurnedStep, TurnedStep]]:

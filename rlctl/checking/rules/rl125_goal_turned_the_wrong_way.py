@@ -13,7 +13,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.checking.worlds import ORIENTATION, Array, Poses, World
+from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
 from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
@@ -21,7 +21,7 @@ RULE = Rule(
     "goal turned the wrong way",
     Severity.WARNING,
     meaning="""
-        The observation has the way to a goal, turned by the orientation of a free body, or by its yaw, in the wrong
+        The observation has the way to a goal, turned by the orientation of a body, or by its yaw, in the wrong
         direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how
         it is turned. A policy that does not see the heading too cannot learn where the goal is.
     """,
@@ -36,11 +36,11 @@ SAME, LEAST_TURN = 0.01, 0.2  # of the elements of rotation matrices; of a rotat
 
 
 class _Frame(NamedTuple):
-    """A free body."""
+    """A free body, or a link of a robot."""
 
     name: str
     client: int
-    body: int
+    link: Link
 
 
 @judges_goals(RULE)
@@ -92,7 +92,7 @@ def _list_turns(quaternion: Array, size: int) -> list[Array]:
 
 
 def _read_orientations(instance: Instance) -> dict[_Frame, Array]:
-    """Return the quaternions, x, y, z, w, of free bodies."""
+    """Return the quaternions, x, y, z, w, of free bodies, and of the links of robots."""
     worlds: list[tuple[World, Poses]] = []
     if (simulation := find_mujoco(instance.env)) is not None:
         reader = MujocoStateReader(*simulation)
@@ -102,8 +102,7 @@ def _read_orientations(instance: Instance) -> dict[_Frame, Array]:
         world = read_world(client)
         worlds.append((world, read_poses(world)))
     return {
-        _Frame(body.name, world.client, body.id): poses[body.id, -1][ORIENTATION]
+        _Frame(world.link_name(link), world.client, link): pose[ORIENTATION]
         for world, poses in worlds
-        for body in world.bodies
-        if body.is_free
+        for link, pose in poses.items()
     }

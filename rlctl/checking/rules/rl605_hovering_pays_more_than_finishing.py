@@ -8,8 +8,9 @@ import numpy as np
 from rlctl.checking import rewards
 from rlctl.checking.episode import zero_action
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.goals import GoalEpisode, GoalTrials, Source, judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
-from rlctl.checking.records import CheckedEpisode, ChildMessage, Records, Skipped
+from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -20,7 +21,8 @@ RULE = Rule(
         The goal ends the episode, and with it a positive reward per step: stopping just before the goal and
         staying there earns more than finishing, so the policy learns to hover. rlctl repeated an episode that
         finished, and stopped shortly before its end; or every recorded success pays less than the steps would
-        have paid that were left, by what episodes without a success earn.
+        have paid that were left, by what episodes without a success earn. Or the check moved the goal: next to the
+        robot, which rests, each step pays, and a success ends that for less.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
@@ -36,7 +38,89 @@ FAR_MORE = 2.0  # times as much as success; it may be worth less to stay where o
 LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
 
 
-@judges_records(RULE, *rewards.WITH_SEARCH)
+NEAR_GOAL = "near the goal"
+"""The fact of an `Income`."""
+FIRST_STEPS, RESTING_STEPS = 15, 12  # with the goal that reset drew, in which robots settle; and next to the robot
+OFFSETS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)  # of the goals' range: how far the goal is from the robot
+STILL = 0.25  # part of this distance that the robot may move
+SHOWN = 3  # episodes that have to show it
+
+
+@dataclasses.dataclass(frozen=True)
+class Income:
+    """What an episode earns that rests near its goal, and what it earns by a success."""
+
+    seed: int
+    per_step: float
+    distance: float
+    success: float
+
+
+@judges_records(RULE, *rewards.WITH_SEARCH, "goals")
+def _compare_incomes(records: Records) -> Iterator[RuleFinding]:
+    found = list(_compare_successes(records))
+    yield from found or _compare_with_moved_goal(records)
+
+
+def _compare_with_moved_goal(records: Records) -> Iterator[RuleFinding]:
+    """Compare what is earned at rest near a goal with what a success pays, which ends the episode."""
+    incomes: list[Income] = records.facts.get(NEAR_GOAL, [])
+    if not incomes:
+        return
+    longest = records.require_built().max_steps or max(one.steps for one in rewards.require_rewarded(records))
+    least = min(incomes, key=lambda one: one.per_step)
+    hovering = rewards.discounted_steps(least.per_step, longest - FIRST_STEPS)
+    paid = max(one.success for one in incomes)
+    if hovering <= FAR_MORE * max(paid, 0.0):
+        return
+    message = (
+        f"success ends the episode and pays {paid:.4g}; resting {least.distance:.3g} from the goal pays"
+        f" {least.per_step:.3g} in each step, {hovering:.4g} until step {longest} (discount {rewards.DISCOUNT})"
+    )
+    evidence = {"seed": least.seed, "value": hovering, "expected": f"below {paid:.6g}", "per_step": least.per_step}
+    yield RuleFinding(RULE, message, evidence)
+
+
+@judges_goals(RULE, decides=False)
+def _rest_near_goal(trials: GoalTrials) -> Iterator[ChildMessage]:
+    """Put the goal at the robot, and next to it."""
+    source = trials.at_goal.source
+    if source is None:
+        return
+    incomes = []
+    for seed in range(FIRST_SEED, FIRST_SEED + SHOWN):
+        income = _measure_income(trials, source, seed)
+        if income is None or income.per_step <= 0:
+            return
+        incomes.append(income)
+    yield Fact(NEAR_GOAL, incomes)
+
+
+def _measure_income(trials: GoalTrials, source: Source, seed: int) -> Income | None:
+    """Return what an episode earns near its goal and at it; None where the robot moves, the success does not end the
+    episode, or the goal is not missed at any distance."""
+    arriving = GoalEpisode(trials, seed, "zero", FIRST_STEPS + 1)
+    if arriving.has_ended or arriving.has_succeeded:
+        return None
+    place = arriving.read(source)
+    at_goal = GoalEpisode(trials, seed, "zero", FIRST_STEPS)
+    success = at_goal.step(place)
+    if not success.succeeds or not at_goal.has_ended:
+        return None
+    for offset in OFFSETS:
+        way = offset * trials.range
+        resting = GoalEpisode(trials, seed, "zero", FIRST_STEPS)
+        steps = resting.play([place + way] * RESTING_STEPS)
+        if resting.has_succeeded:
+            continue
+        distance = float(np.linalg.norm(way))
+        is_still = not resting.has_ended and np.linalg.norm(resting.read(source) - place) <= STILL * distance
+        # What is paid for a change of the distance is paid once, when the goal is moved.
+        late = min(step.reward for step in steps[RESTING_STEPS // 2 :]) if is_still else 0.0
+        return Income(seed, late, distance, success.reward)
+    return None
+
+
 def _compare_successes(records: Records) -> Iterator[RuleFinding]:
     """Compare what recorded successes pay with what their episodes would have earned without them."""
     episodes = rewards.require_rewarded(records)

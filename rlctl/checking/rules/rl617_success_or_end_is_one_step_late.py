@@ -27,6 +27,8 @@ RULE = Rule(
 FEWEST_SEEDS, MANY_SEEDS = 3, 8  # that events come from: few need one step that leaves the limit again
 MOST_LIMITS = 2
 JUMP = 1.5  # times nearly all other changes
+NOISE = 3.0 / (0.6745 * np.sqrt(6.0))
+"""Three standard deviations of white noise, by the median size of its second differences."""
 
 
 @judges_records(RULE, *rewards.WITH_SEARCH)
@@ -54,8 +56,9 @@ class _Limit:
     limit: float
     covered: NDArray[np.bool_]  # Shape (n,)
 
-    def crosses(self, values: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(self.sign * values[:, self.column] < self.limit)
+    def crosses(self, values: NDArray[np.float64], beyond: float = 0.0) -> NDArray[np.bool_]:
+        """Say which values are below the limit, and as far below it as is given."""
+        return np.asarray(self.sign * values[:, self.column] < self.limit - beyond)
 
 
 def _find_late_limits(steps: Transitions, is_event: NDArray[np.bool_], most: int) -> str:
@@ -66,9 +69,13 @@ def _find_late_limits(steps: Transitions, is_event: NDArray[np.bool_], most: int
     after = _measure(steps.after, steps.names)
     if _find_limits(after.values, is_event, most):
         return ""
-    now = np.any([limit.crosses(after.values) for limit in limits], axis=0)
+    noise = [_measure_noise(after.values[:, limit.column], steps.episodes) for limit in limits]
+    now, nearly = (
+        np.any([limit.crosses(after.values, side * by) for limit, by in zip(limits, noise, strict=True)], axis=0)
+        for side in (1.0, -1.0)
+    )
     seeds = len(np.unique(steps.seeds[is_event]))
-    missed, is_past = int((now & ~is_event).sum()), bool((is_event & ~now).any())
+    missed, is_past = int((now & ~is_event).sum()), bool((is_event & ~nearly).any())
     if missed < min(seeds, MANY_SEEDS) or not (is_past or seeds >= MANY_SEEDS):
         return ""
     for limit in limits:  # a goal that moves when it is reached is not late
@@ -79,6 +86,13 @@ def _find_late_limits(steps: Transitions, is_event: NDArray[np.bool_], most: int
         f"{before.names[limit.column]} {'<' if limit.sign > 0 else '>'} {limit.sign * limit.limit:.4g}"
         for limit in limits
     )
+
+
+def _measure_noise(values: NDArray[np.float64], episodes: NDArray[np.int64]) -> float:
+    """Return how far noise takes values that are otherwise smooth."""
+    together = episodes[2:] == episodes[:-2]
+    seconds = np.abs(values[2:] - 2 * values[1:-1] + values[:-2])[together]
+    return float(NOISE * np.median(seconds)) if seconds.size else 0.0
 
 
 def _measure(rows: NDArray[np.float64], names: Sequence[str]) -> Quantities:

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import WEIGHED_TERMS
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     ENOUGH_STEPS,
@@ -25,7 +26,7 @@ RULE = Rule(
         A reward term that is named after the actions, their change, or the effort of the motors is exactly 0 at
         every recorded step, although the actions changed. It costs nothing, so nothing keeps the motions smooth or
         cheap. Terms whose name says that only a part counts, such as excess_torque, are not judged. An info in a
-        plain environment, whose weight of the term may be 0.
+        plain environment, unless its source multiplies the term by a known number other than 0.
     """,
     fix="""
         Look at what the term is computed from. An action must not be compared with itself: keep a copy of the last
@@ -34,21 +35,25 @@ RULE = Rule(
 )
 
 
-@judges_records(RULE, *WITH_SEARCH, of_absence=True)
+@judges_records(RULE, *WITH_SEARCH, "attributes", of_absence=True)
 def _find_zero_costs(records: Records) -> Iterator[RuleFinding]:
     episodes = require_terms(records)
     if _count_changes(episodes) < ENOUGH_STEPS:
         raise NotJudged(f"the actions changed in fewer than {ENOUGH_STEPS} steps")
     raw_terms = join_terms(episodes, RAW_TERMS)
+    weighed: dict[str, tuple[str, int]] = records.facts.get(WEIGHED_TERMS, {})
     for name, values in join_terms(episodes).items():
         raw = raw_terms.get(name)
         is_weightless = raw is not None and raw.any()
         if not values.any() and not is_weightless and is_about_actions(name, ENERGY_WORDS):
             message = f"reward term {name!r} is 0 at every step of {summarize(episodes)}"
-            severity = Severity.WARNING
-            if raw is None:
-                severity = Severity.INFO
-            yield RuleFinding(RULE, message, {"term": name, "value": 0.0, "episodes": len(episodes)}, severity)
+            severity = Severity.INFO
+            if raw is not None:
+                severity = Severity.WARNING
+            elif name in weighed:
+                message, severity = f"{message}, although its weight is not 0", Severity.WARNING
+            evidence = {"term": name, "value": 0.0, "episodes": len(episodes)}
+            yield RuleFinding(RULE, message, evidence, severity, where=weighed.get(name))
 
 
 def _count_changes(episodes: Sequence[CheckedEpisode]) -> int:

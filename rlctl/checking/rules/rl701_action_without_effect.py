@@ -18,7 +18,8 @@ RULE = Rule(
         to the last bit. Noise on such an element only costs exploration. An element that only changes the
         reward of its own step (a cost) or its own copy in the observation moves nothing either. An error if no
         element does anything else: there is nothing to learn. An info if the reward of the own step can also
-        rise, as in a bandit, or if all values in one half of the range do the same.
+        rise, as in a bandit, or if all values in one half of the range do the same; a warning where that is so for
+        every element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
@@ -59,7 +60,9 @@ def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
     yield from _without_effect(effects, len(every), left_out)
     if halves:
         message = f"half of the range is dead, every value there has the same effect: {list_names(halves)}"
-        yield _finding(halves, message, Severity.INFO, fix=WHOLE_RANGE)
+        # A single motor may act in one direction only. That all do is what a clip to the wrong range leaves.
+        is_all = len(halves) == len(every) > 1
+        yield _finding(halves, message, Severity.WARNING if is_all else Severity.INFO, fix=WHOLE_RANGE)
 
 
 def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:

@@ -1,23 +1,19 @@
 """RL825: any contact counts."""
 
 import collections
-import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.contact_trials import PlayedContacts, play_in_bullet, play_in_mujoco
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
-from rlctl.checking.instance import EnvironmentRaised, Instance
+from rlctl.checking.instance import EnvironmentRaised
 from rlctl.checking.mujoco_worlds import MujocoStateReader
-from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
-from rlctl.checking.values import find_numbers, flatten, list_parts
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array, Link, Pair
 from rlctl.environments.bullet_calls import Contacts
-from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
     "RL825",
@@ -36,35 +32,9 @@ RULE = Rule(
 
 RESTS = 0.8  # of all looks after a reset, in which two bodies touch
 OFTEN = 0.3  # of all looks, in which two of their links do
-SEEDS = (FIRST_SEED + 1, FIRST_SEED + 2)
-STEPS, FEWEST_STEPS = 15, 4  # of an episode with the zero action; those in which something rests
 LEAST_CHANGE = 1e-3  # of what contacts change
 SAME = 1e-6  # relative
 MOST_PARTS = 6  # bumps that are tried
-
-
-@dataclasses.dataclass(frozen=True)
-class _Played:
-    """What the steps of some episodes returned."""
-
-    names: list[str]
-    rows: list[list[Array]]  # by episode and step: observation, numbers of the info, reward and `terminated`
-    asked: list[list[bool]]  # by episode and step: whether the engine had a contact that was shown
-
-    def pair(self, other: "_Played") -> tuple[Array, Array] | None:
-        """Return the steps of both in which this one had contacts, shape (steps, columns) each; None for few, and where
-        the other one has other columns."""
-        pairs = [
-            (row, of_other)
-            for rows, asked, others in zip(self.rows, self.asked, other.rows, strict=True)
-            for row, is_asked, of_other in zip(rows, asked, others, strict=False)
-            if is_asked
-        ]
-        if len({row.shape for pair in pairs for row in pair}) != 1:
-            return None
-        first, second = np.array(pairs).transpose(1, 0, 2)
-        ended = any(row[-1] for row in first)
-        return (first, second) if ended or len(first) >= FEWEST_STEPS else None
 
 
 @judges_worlds(RULE, place=94)
@@ -168,7 +138,7 @@ def _describe(
     return RuleFinding(RULE, message, {"element": found[0][0], "elements": [text for text, _ in found][:8]})
 
 
-def _find_constant(standing: _Played, without: _Played, again: _Played) -> dict[int, float]:
+def _find_constant(standing: PlayedContacts, without: PlayedContacts, again: PlayedContacts) -> dict[int, float]:
     """Return the columns in which all steps differ by the same amount without contacts, and the amount."""
     pairs, repeated = standing.pair(without), standing.pair(again)
     if pairs is None or repeated is None:
@@ -181,7 +151,7 @@ def _find_constant(standing: _Played, without: _Played, again: _Played) -> dict[
     return {column: float(size[column]) for column in columns.tolist()}
 
 
-def _is_same(standing: _Played, bumped: _Played, again: _Played, column: int) -> bool:
+def _is_same(standing: PlayedContacts, bumped: PlayedContacts, again: PlayedContacts, column: int) -> bool:
     pairs, repeated = standing.pair(bumped), standing.pair(again)
     if pairs is None or repeated is None:
         return False
@@ -190,54 +160,17 @@ def _is_same(standing: _Played, bumped: _Played, again: _Played, column: int) ->
     return bool(off <= 10 * noise + SAME * (1 + np.abs(pairs[0][:, column]).max()))
 
 
-def _play(instance: Instance, shown: Callable[[], bool]) -> _Played:
-    """Play episodes; `shown` says whether there were contacts since it was called last."""
-    played = _Played([], [], [])
-    for seed in SEEDS:
-        played.rows.append([])
-        played.asked.append([])
-        for moment in EpisodePlayer(instance, seed, "zero", max_steps=STEPS):
-            is_shown = shown()
-            if moment.step == 0:
-                continue
-            info = dict(find_numbers(moment.info)) if isinstance(moment.info, dict) else {}
-            observed = np.nan_to_num(flatten(moment.observation).astype(np.float64))
-            numbers = np.nan_to_num([*info.values(), moment.reward_number, float(moment.flags[0])])
-            played.rows[-1].append(np.concatenate([observed, numbers]))
-            played.asked[-1].append(is_shown)
-            if not played.names:
-                parts = list_parts(moment.observation)
-                played.names.extend(f"{name}[{number}]" for name, size in parts for number in range(size))
-                played.names.extend([*(f"info[{name!r}]" for name in info), "the reward", "the end of the episode"])
-    return played
-
-
 def _play_in_bullet(
     watched: WatchedWorlds, world: LoggedWorld, kept: set[Pair], bump: tuple[Link, Link] | None
-) -> _Played:
-    client, was_shown = world.world.client, False
-
+) -> PlayedContacts:
     def change(asked: Sequence[int | None], contacts: Contacts) -> Contacts:
-        nonlocal was_shown
-        if asked[4] != client:
-            return contacts
         links = [((contact[1], contact[3]), (contact[2], contact[4])) for contact in contacts]
         pairs = zip(contacts, links, strict=True)
         shown = [contact for contact, pair in pairs if pair in kept or pair[::-1] in kept]
         shown += _make_contacts(asked, bump) if bump is not None else ()
-        was_shown |= bool(shown)
         return tuple(shown)
 
-    def read_shown() -> bool:
-        nonlocal was_shown
-        is_shown, was_shown = was_shown, False
-        return is_shown
-
-    watched.calls.change_contacts = change
-    try:
-        return _play(watched.instance, read_shown)
-    finally:
-        watched.calls.change_contacts = None
+    return play_in_bullet(watched, world, change)
 
 
 def _make_contacts(asked: Sequence[int | None], bump: tuple[Link, Link]) -> Iterator[tuple[Any, ...]]:
@@ -252,31 +185,15 @@ def _make_contacts(asked: Sequence[int | None], bump: tuple[Link, Link]) -> Iter
 
 def _play_in_mujoco(
     watched: WatchedWorlds, world: LoggedWorld, kept: set[Pair], bump: tuple[Link, Link] | None
-) -> _Played:
-    simulation, reader = find_mujoco(watched.instance.env), world.reader
-    assert simulation is not None  # it was logged
+) -> PlayedContacts:
+    reader = world.reader
     assert isinstance(reader, MujocoStateReader)
     geoms = [] if bump is None else [reader.find_geom(link) for link in bump]
-    data_of_env, was_shown = simulation[1], False
 
-    def change(_: Any, data: Any) -> None:
-        nonlocal was_shown
-        if data is not data_of_env or not data.ncon:
-            return
-        pairs = data.contact.geom.copy()
-        links = [(reader.find_link(one), reader.find_link(two)) for one, two in pairs.tolist()]
-        shown = pairs[[pair in kept or pair[::-1] in kept for pair in links]]
+    def change(pairs: Array) -> Array:
         if geoms:
-            shown = np.array([geoms])
-        was_shown = bool(len(shown))
-        data.ncon = len(shown)  # of the contacts that are there, whose forces stay
-        if was_shown:
-            data.contact.geom[:] = shown
-            data.contact.geom1[:], data.contact.geom2[:] = shown.T
+            return np.array([geoms])
+        links = [(reader.find_link(one), reader.find_link(two)) for one, two in pairs.tolist()]
+        return pairs[[pair in kept or pair[::-1] in kept for pair in links]]
 
-    calls = watched.mujoco_calls
-    calls.after_step, calls.after_forward = change, change
-    try:
-        return _play(watched.instance, lambda: was_shown)
-    finally:
-        calls.after_step, calls.after_forward = type(calls).after_step, type(calls).after_forward
+    return play_in_mujoco(watched, change)

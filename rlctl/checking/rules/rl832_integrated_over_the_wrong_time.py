@@ -1,0 +1,59 @@
+"""RL832: integrated over the wrong time."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.records import Records
+from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
+from rlctl.checking.step_times import find_declared, find_rates
+
+RULE = Rule(
+    "RL832",
+    "integrated over the wrong time",
+    Severity.WARNING,
+    meaning="""
+        In a robot without an engine a position or an angle changes by its velocity times another time than all others
+        do: by the time of a whole step in each of its substeps, or by that of one substep in a whole step. It moves
+        so many times faster or slower than its velocity says. How long a step takes is what the robot declares, as
+        `dt` and `substeps`, and what its other positions and velocities confirm.
+    """,
+    fix="Integrate everything with the time of the loop that it is in: the substep's time inside the loop of substeps.",
+)
+
+NEAR = 0.1  # relative error of a time that is estimated
+
+
+@judges_records(RULE, "attributes")
+def _find_wrong_integration(records: Records) -> Iterator[RuleFinding]:
+    log: AttributeLog = records.require_fact("attributes")
+    if np.isfinite(log.physics_s):
+        raise NotApplicable("an engine integrates")
+    declared = find_declared(log)
+    if declared is None:
+        raise NotApplicable("no step has several substeps, as far as it is known")
+    rates = find_rates(log, log.values)
+    for name, declared_s in declared.times.items():
+        for control_s in (declared_s, declared_s * declared.substeps):
+            right = [pair for pair in rates if math.isclose(pair[2], control_s, rel_tol=NEAR)]
+            for factor in (declared.substeps, 1 / declared.substeps) if right else ():
+                wrong = [pair for pair in rates if math.isclose(pair[2], factor * control_s, rel_tol=NEAR)]
+                if wrong and len(wrong) <= len(right):
+                    yield _describe(
+                        log, wrong[0], right[0], f"{name} is {declared_s:.3g} s, {declared.count} {declared.substeps}"
+                    )
+                    return
+
+
+def _describe(
+    log: AttributeLog, wrong: tuple[int, int, float], right: tuple[int, int, float], declared: str
+) -> RuleFinding:
+    one, two = (
+        f"{log.names[column]} changes by {log.names[rate]} times {seconds:.3g} s"
+        for column, rate, seconds in (wrong, right)
+    )
+    message = f"in a step {one}, and {two}: {declared}"
+    return RuleFinding(RULE, message, {"element": log.names[wrong[0]], "value": wrong[2], "expected": right[2]})

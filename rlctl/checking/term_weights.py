@@ -1,0 +1,165 @@
+"""Finds in the source of an environment which reward terms have a weight that is not 0."""
+
+import ast
+import contextlib
+import dataclasses
+import functools
+import inspect
+import math
+import sys
+import textwrap
+from collections.abc import Iterator
+from typing import Any
+
+from rlctl.checking.values import NUMBERS, find_author, list_own_classes
+
+CONVERSIONS = {"float", "float32", "float64", "item", "asarray", "array"}
+"""Functions that return what they are given."""
+DEEPEST = 6  # names and methods that are followed
+COMPUTED, UNKNOWN = "computed", math.nan  # what else than a known number a factor may be
+Factor = float | str
+Place = tuple[str, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class _TermSource:
+    """The methods of an object, in which expressions are read."""
+
+    author: Any
+    methods: list[tuple[str, ast.FunctionDef]]
+
+    @functools.cached_property
+    def states(self) -> frozenset[str]:
+        """The attributes that other methods than the constructor assign."""
+        return frozenset(
+            node.attr
+            for _, method in self.methods
+            if method.name != "__init__"
+            for node in ast.walk(method)
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store)
+        )
+
+    def list_entries(self) -> Iterator[tuple[str, list[Factor], Place]]:
+        """Yield each value that gets a constant key in a dictionary, as its key, its factors and its place."""
+        for file, method in self.methods:
+            for node in ast.walk(method):
+                for key, value in _read_entries(node):
+                    yield key, self.list_factors(value, method), (file, value.lineno)
+
+    def list_factors(self, value: ast.expr, function: ast.FunctionDef, depth: int = 0) -> list[Factor]:
+        """Return the factors of a product; of anything else, the value itself is the only one."""
+        if depth > DEEPEST:
+            return [UNKNOWN]
+
+        def follow(part: ast.expr, inside: ast.FunctionDef = function) -> list[Factor]:
+            return self.list_factors(part, inside, depth + 1)
+
+        match value:
+            case ast.UnaryOp(operand=operand):
+                return follow(operand)
+            case ast.BinOp(left=left, op=ast.Mult(), right=right):
+                return follow(left) + follow(right)
+            case ast.BinOp(left=left, op=ast.Div()):
+                return follow(left)
+            case ast.Constant(value=str()):
+                return []  # a unit, or a name
+            case ast.Constant(value=number):
+                return [float(number) if isinstance(number, NUMBERS) else UNKNOWN]
+            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=[only]) if name in CONVERSIONS:
+                return follow(only)
+            case ast.Call(func=ast.Attribute(value=ast.Name(id="self"), attr=name)):
+                method = next((one for _, one in self.methods if one.name == name), None)
+                returned = [node.value for node in ast.walk(method) if isinstance(node, ast.Return)] if method else []
+                return follow(returned[0], method) if method and len(returned) == 1 and returned[0] else [UNKNOWN]
+            case ast.Name(id=name):
+                assigned = _find_assigned(function, name)
+                if assigned:
+                    return follow(assigned[0]) if len(assigned) == 1 else [UNKNOWN]
+                return [self._read_number(value)]
+            case ast.Attribute(value=ast.Name(id="self"), attr=name) if name in self.states:
+                return [COMPUTED]
+            case ast.Attribute() | ast.Subscript():
+                return [self._read_number(value)]
+            case ast.BinOp() | ast.Call() | ast.Compare():
+                return [COMPUTED]
+        return [UNKNOWN]
+
+    def _read_number(self, value: ast.expr) -> float:
+        """Return the present number of a name, an attribute or an entry; `UNKNOWN` where it is none."""
+        found = self._look_up(value)
+        return float(found) if isinstance(found, NUMBERS) else UNKNOWN
+
+    def _look_up(self, value: ast.expr) -> Any:
+        match value:
+            case ast.Name(id="self"):
+                return self.author
+            case ast.Name(id=name):
+                module = sys.modules[type(self.author).__module__]
+                return vars(module).get(name)
+            case ast.Attribute(value=owner, attr=name):
+                found = self._look_up(owner)
+                return inspect.getattr_static(found, name, None) if found is not None else None
+            case ast.Subscript(value=owner, slice=ast.Constant(value=key)):
+                found = self._look_up(owner)
+                return found.get(key) if isinstance(found, dict) else None
+        return None
+
+
+def find_weighed_terms(env: Any) -> dict[str, Place]:
+    """Return file and line of what is computed for each key of a dictionary that the source has, where it is multiplied
+    by known numbers other than 0, and the key has no other weight."""
+    author = find_author(env)
+    entries: dict[str, list[tuple[list[Factor], Place]]] = {}
+    for key, factors, place in _TermSource(author, list_methods(author)).list_entries():
+        entries.setdefault(key, []).append((factors, place))
+    held = {key: value for one in vars(author).values() if isinstance(one, dict) for key, value in one.items()}
+    found = {}
+    for key, listed in entries.items():
+        factors = [factor for some, _ in listed for factor in some]
+        factors += [float(held[key])] if isinstance(held.get(key), NUMBERS) else []
+        weights = [factor for factor in factors if factor != COMPUTED]
+        if COMPUTED in factors and weights and all(isinstance(w, float) and w and math.isfinite(w) for w in weights):
+            found[key] = next(place for some, place in listed if COMPUTED in some)
+    return found
+
+
+def list_methods(author: Any) -> list[tuple[str, ast.FunctionDef]]:
+    """Return the methods that an object has of its own classes, each with its file; line numbers are those of the
+    file."""
+    methods: dict[str, Any] = {}
+    for cls in list_own_classes(author):
+        for name, member in vars(cls).items():
+            methods.setdefault(name, member.__func__ if isinstance(member, staticmethod | classmethod) else member)
+    found = []
+    for method in methods.values():
+        with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
+            lines, first = inspect.getsourcelines(method)
+            (node,) = ast.parse(textwrap.dedent("".join(lines))).body
+            if isinstance(node, ast.FunctionDef):
+                ast.increment_lineno(node, first - 1)
+                found.append((str(inspect.getsourcefile(method)), node))
+    return found
+
+
+def _read_entries(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    match node:
+        case ast.Dict(keys=keys, values=values):
+            for key, value in zip(keys, values, strict=True):
+                if isinstance(key, ast.Constant) and isinstance(key.value, str):
+                    yield key.value, value
+        case ast.Assign(targets=[ast.Subscript(slice=ast.Constant(value=str(key)))], value=value):
+            yield key, value
+        case ast.Call(func=ast.Name(id="dict"), keywords=keywords):
+            for keyword in keywords:
+                if keyword.arg:
+                    yield keyword.arg, keyword.value
+
+
+def _find_assigned(function: ast.FunctionDef, name: str) -> list[ast.expr]:
+    """Return what a function assigns to a local name."""
+    found = []
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign):
+            is_own = any(isinstance(target, ast.Name) and target.id == name for target in node.targets)
+            found += [node.value] if is_own else []
+    return found
