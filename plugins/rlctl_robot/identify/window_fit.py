@@ -14,7 +14,7 @@ from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.unknowns import UnknownValues
 from rlctl_robot.identify.windows import WindowPlayer
 
-_MOST_ITERATIONS = 15
+_MOST_ITERATIONS = 60
 ENOUGH = 0.5  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
 _NEAR = 0.2  # relative decrease of the cost, below which derivatives hold for the next step too
 _DAMPINGS = (0.01, 0.1, 1.0, 10.0, 1000.0)  # factors of the last damping, tried in one batch
@@ -56,9 +56,9 @@ class _Derivatives:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Equations:
-    """Normal equations: of the values, of each window's start state, and between them."""
+    """Normal equations of each window: of the values, of its start state, and between them."""
 
-    values: Array  # (unknowns, unknowns)
+    values: Array  # (windows, unknowns, unknowns)
     states: Array  # (windows, states, states)
     mixed: Array  # (windows, unknowns, states)
     values_gradient: Array  # (windows, unknowns)
@@ -179,9 +179,8 @@ class WindowFitter:
             (part * weights[..., None]).reshape(windows, errors.shape[1], -1)
             for part in (derivatives.values, derivatives.states)
         )
-        flat = of_values.reshape(-1, of_values.shape[-1])
         return _Equations(
-            values=flat.T @ flat,
+            values=np.swapaxes(of_values, 1, 2) @ of_values,
             states=_tie(np.swapaxes(of_states, 1, 2) @ of_states),
             mixed=np.swapaxes(of_values, 1, 2) @ of_states,
             values_gradient=np.einsum("wip,wi->wp", of_values, errors),
@@ -189,21 +188,24 @@ class WindowFitter:
         )
 
     def _reduce(self, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
-        """Eliminate the start states: return the matrix and gradients (windows, unknowns) of the values alone."""
+        """Eliminate the start states: return each window's matrix and gradient of the values alone.
+
+        Their shapes are (windows, unknowns, unknowns) and (windows, unknowns).
+        """
         size = equations.states.shape[-1]
         inverse = np.asarray(np.linalg.inv(equations.states * (1.0 + damping * np.eye(size))), np.float64)
         influence = equations.mixed @ inverse
-        matrix = equations.values - np.einsum("wps,wqs->pq", influence, equations.mixed, optimize=True)
+        matrices = equations.values - influence @ np.swapaxes(equations.mixed, 1, 2)
         gradients = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
-        return matrix, gradients, inverse
+        return matrices, gradients, inverse
 
     def _step(self, point: _Point, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
         """Return the values and start states after a step of Levenberg and Marquardt within the values' bounds."""
-        matrix, gradients, inverse = self._reduce(equations, damping)
+        matrices, gradients, inverse = self._reduce(equations, damping)
         known = 1.0 / np.square(self._doubt)
-        matrix = matrix + np.diag(known)
+        matrix = matrices.sum(axis=0) + np.diag(known)
         gradient = gradients.sum(axis=0) + known * (point.vector - self._center)
-        matrix = matrix + damping * np.diag(np.diag(equations.values) + known)
+        matrix = matrix + damping * np.diag(np.diag(equations.values.sum(axis=0)) + known)
         change = _solve_bounded(matrix, gradient, self._lowest - point.vector)
         pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
         moved = -np.einsum("wst,wt->ws", inverse, pull)
@@ -217,15 +219,16 @@ class WindowFitter:
     def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
         noise = self._estimate_noise(point.errors)
         equations = self._form_equations(point, derivatives, noise)
-        information, gradients, _ = self._reduce(equations, 0.0)
-        known = np.diag(1.0 / np.square(self._doubt))
-        inverse = np.linalg.inv(information + known)
-        # Errors of a window are alike, such as those of the model: what the windows say differs more than their noise.
-        gradients = gradients - gradients.mean(axis=0)
-        count = len(gradients)
-        spread = count / max(count - 1, 1) * gradients.T @ gradients
-        measured = inverse @ spread @ inverse
-        widen = np.sqrt(np.maximum(1.0, np.diag(measured) / np.diag(inverse)))
+        matrices, gradients, _ = self._reduce(equations, 0.0)
+        information = matrices.sum(axis=0)
+        total = information + np.diag(1.0 / np.square(self._doubt))
+        inverse = np.linalg.inv(total)
+        # Errors of a window are alike, such as those of the model: values differ more than their noise tells where one
+        # window is left out. The jackknife counts this in full where few windows tell a value (Efron and Stein, 1981).
+        moved = np.linalg.solve(total - matrices, gradients[..., None])[..., 0]
+        moved = moved - moved.mean(axis=0)
+        measured = (1.0 - 1.0 / len(moved)) * np.square(moved).sum(axis=0)
+        widen = np.sqrt(np.maximum(1.0, measured / np.diag(inverse)))
         return WindowFit(point.vector, information, inverse * np.outer(widen, widen), noise)
 
 
