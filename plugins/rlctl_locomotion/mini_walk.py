@@ -39,7 +39,8 @@ class MiniWalk(Clocked):
     fallen_height: ClassVar[float] = 0.2
     lowest: ClassVar[np.ndarray] = np.array([-0.4, -0.15, -0.8])
     highest: ClassVar[np.ndarray] = np.array([0.4, 0.15, 0.8])
-    scale = 0.3
+    scale = 0.3  # [m/s]; so far from the command, tracking is worth 1/e
+    turn_scale = 1.0  # [rad/s], likewise; a light trunk above heavy legs twists at each step
 
     action_space = Box(-4.0, 4.0, (14,), np.float32)
     observation_terms = {
@@ -91,6 +92,7 @@ class MiniWalk(Clocked):
         return {"velocity": velocity, "height": self.measure_height()[:, None], "foot_heights": self.measure_feet()}
 
     def rewards(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Return what `Clocked` does, and how far hips, neck and head are from the stance."""
+        """Return what `Clocked` does, with a scale of its own for turning, and how far it is bent from the stance."""
         bent = np.compress(KEPT, self.body.joint_positions - self.stance, axis=1)
-        return {**super().rewards(action), "pose": rewards.squared(bent)}
+        turning = rewards.closeness(self.command[:, 2] - self.turning[:, 2], self.turn_scale)
+        return {**super().rewards(action), "turning": turning, "pose": rewards.squared(bent)}

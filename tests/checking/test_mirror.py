@@ -25,7 +25,7 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 @pytest.mark.slow_except("walk")
-@pytest.mark.parametrize("task", ["walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk"])
+@pytest.mark.parametrize("task", ["walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk"])
 def test_sound_declarations(task):
     assert found(task, "RL120") == set()
 
