@@ -19,6 +19,11 @@ OTHER_MOTOR = tuple(map(abs, OTHER_SIDE))
 SOLE = 0.03  # [m], from an ankle to the ground
 
 
+def widen(nominal: float, low: float, high: float) -> dict[str, tuple[float, float]]:
+    """Return a range that is the nominal value at level 0: whoever draws all from the start learns to stand only."""
+    return {"from": (nominal, nominal), "to": (low, high)}
+
+
 @dataclass
 class MiniWalk(Clocked):
     """Walk forwards, sideways and turn as commanded, without falling; linear velocity is not observed."""
@@ -68,12 +73,19 @@ class MiniWalk(Clocked):
         "events/motor_friction": OTHER_MOTOR,
     }
     events = {
-        **{name: event for name, event in Clocked.events.items() if name != "motor_strength"},
-        "voltage": Event("reset", events.voltage, body="robot", voltage_v=(6.4, 8.4)),  # two lithium cells
-        "torque_constant": Event("reset", events.torque_constant, body="robot", factor=(0.9, 1.1)),
-        "motor_friction": Event("reset", events.motor_friction, body="robot", coulomb_nm=(0.02, 0.1)),
-        "motor_bias": Event("reset", events.motor_bias, body="robot", bias_rad=(-0.03, 0.03)),
-        "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=(0.0, 0.3)),  # [m/s]
+        "mass": Event("reset", events.scale_mass, body="robot", factor=widen(1.0, 0.8, 1.2)),
+        "friction": Event("reset", events.set_friction, body="ground", friction=widen(0.8, 0.4, 1.2)),
+        "voltage": Event("reset", events.voltage, body="robot", voltage_v=widen(7.4, 6.4, 8.4)),  # of two lithium cells
+        "torque_constant": Event("reset", events.torque_constant, body="robot", factor=widen(1.0, 0.9, 1.1)),
+        "motor_friction": Event("reset", events.motor_friction, body="robot", coulomb_nm=widen(0.05, 0.02, 0.1)),
+        "motor_bias": Event("reset", events.motor_bias, body="robot", bias_rad=widen(0.0, -0.03, 0.03)),
+        "gyroscope_noise": Event("observation", events.noise, of="gyroscope", std=widen(0.0, 0.0, 0.2)),  # [rad/s]
+        "position_noise": Event("observation", events.noise, of="joint_positions", std=widen(0.0, 0.0, 0.01)),  # [rad]
+        "velocity_noise": Event(
+            "observation", events.noise, of="joint_velocities", std=widen(0.0, 0.0, 0.5)
+        ),  # [rad/s]
+        "action_delay": Event("action", events.delay, steps=widen(0, 0, 1)),  # of one action
+        "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=widen(0.0, 0.0, 0.3)),  # [m/s]
     }
     rlctl_ignore = {**Clocked.rlctl_ignore, "RL610": "whoever is commanded to stand does so at first, and then falls"}
 
