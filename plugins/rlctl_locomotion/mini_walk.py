@@ -87,7 +87,6 @@ class MiniWalk(Clocked):
         "action_delay": Event("action", events.delay, steps=widen(0, 0, 1)),  # of one action
         "push": Event("interval", events.kick, every_s=4.0, body="robot", speed=widen(0.0, 0.0, 0.3)),  # [m/s]
     }
-    rlctl_ignore = {**Clocked.rlctl_ignore, "RL610": "whoever is commanded to stand does so at first, and then falls"}
 
     def build(self, sim: Sim) -> None:
         """Load the ground and the robot, whose joints have servos, not the springs of the family."""
