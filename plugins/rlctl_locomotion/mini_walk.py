@@ -36,8 +36,8 @@ class MiniWalk(Clocked):
     joint_order: ClassVar[list[str]] = JOINTS
     self_collision: ClassVar[bool] = True
     stance: ClassVar[np.ndarray] = STANCE
-    period_s: ClassVar[float] = 0.5
-    swing: ClassVar[float] = 0.03
+    period_s: ClassVar[float] = 0.45
+    swing: ClassVar[float] = 0.025
     first_half: ClassVar[tuple[float, float]] = (1.0, -1.0)
     start_height: ClassVar[float] = 0.295
     target_height: ClassVar[float] = 0.285

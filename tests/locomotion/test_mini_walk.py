@@ -43,7 +43,7 @@ def test_it_starts_on_its_feet_and_must_lift_one(env, task):
     steps = 1
     while not env.step(np.zeros(14, np.float32))[2]:
         steps += 1
-    # Wanted is more than 90 % of the swing from asin(0.9) / (2 pi) of the period on: 0.089 s, the fifth step.
+    # Wanted is more than 90 % of the swing from asin(0.9) / (2 pi) of the period on: 0.08 s, the fifth step.
     assert steps == 5
     assert task.measure_height() == pytest.approx(task.target_height, abs=0.005)
     assert task.fallen

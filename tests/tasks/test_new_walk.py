@@ -172,7 +172,7 @@ OTHER_FRAMES = {
     'name="right_knee"': 'name="right_knee" pos="0 0.03 0"',
     'name="right_foot"': 'name="right_foot" euler="1.5708 0 0"',
     'name="left_foot"': 'name="left_foot" euler="1.5708 0 0"',
-    'pos="0.005 0 -0.022" size="0.05 0.03 0.008"': 'pos="0.005 -0.022 0" size="0.05 0.008 0.03"',  # of the feet
+    'pos="0.005 0 -0.022" size="0.05 0.028 0.008"': 'pos="0.005 -0.022 0" size="0.05 0.008 0.028"',  # of the feet
 }
 
 
