@@ -20,7 +20,7 @@ SOLE = 0.03  # [m], from an ankle to the ground
 
 
 def widen(nominal: float, low: float, high: float) -> dict[str, tuple[float, float]]:
-    """Return a range that is the nominal value at level 0: whoever draws all from the start learns to stand only."""
+    """Return a range that grows from the nominal value: with full ranges from the start it stepped on the spot."""
     return {"from": (nominal, nominal), "to": (low, high)}
 
 
