@@ -77,7 +77,7 @@ def test_tasks_of_a_distribution(pytester):
             assert task != "reach"
         """,
     )
-    result.assert_outcomes(passed=23, failed=1)
+    result.assert_outcomes(passed=24, failed=1)
 
 
 @pytest.mark.slow

@@ -94,7 +94,10 @@ def test_the_wheels_train_reach_from_an_empty_folder(wheels, tmp_path):
     tasks = json.loads(call(scripts / "rlctl", "tasks", "--check", "--json", "-", cwd=empty))["tasks"]
     assert {(task["name"], task["algo"], task["problem"]) for task in tasks} == {
         *((name, "ppo", None) for name in ("reach", "reach-batch", "pick", "place")),
-        *((name, "ppo", None) for name in ("walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk")),
+        *(
+            (name, "ppo", None)
+            for name in ("walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk")
+        ),
         *((name, "tqc", None) for name in ("ant", "biped", "half-cheetah", "hopper", "humanoid", "walker2d")),
         *((name, "sac", None) for name in ("biped-3d", "quadruped", "reach-sparse")),
         *((name, "sac", None) for name in ("kuka-grasp", "gear-arm", "peg-insert", "screw-drive")),

@@ -272,8 +272,9 @@ def _judge_torques(legged: _Legged) -> list[str]:
 def _judge_densities(body: MujocoBody) -> list[str]:
     """Return a sentence for links that are denser than any metal, and for a robot that is lighter than air."""
     model, dense, volume = body._sim.model, [], 0.0
+    solids = [geom for geom in body.parts.geoms if model.geom_type[geom] != 0]  # no planes: a file may have a floor
     for number, link in body.parts.link_names.items():
-        geoms = [geom for geom in body.parts.geoms if int(model.geom_bodyid[geom]) == number]
+        geoms = [geom for geom in solids if int(model.geom_bodyid[geom]) == number]
         box = float(sum(8 * np.prod(model.geom_aabb[geom, 3:]) for geom in geoms))  # [m^3], at least that of the link
         mass = float(model.body_mass[number])
         volume += box

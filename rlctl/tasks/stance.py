@@ -14,6 +14,7 @@ from rlctl.tasks.shapes import Array
 _BENT, _BENT_OF_TWO = 0.77, 0.88  # of the longest leg: height of the hip in the stance; on two legs
 _SPRAWLED = (0.5, 0.55)  # of the longest leg: height of the hip, distance of the foot to its side
 _LONGEST = 0.95  # of the longest leg, where legs differ
+_STRETCHED = 0.97  # of a stretched leg on a level sole; long feet that point down make the longest leg much longer
 _MARGIN = 0.05  # of a joint's range, to its limits
 _ALIKE = 0.03  # of the longest leg: how far apart a leg and the mirror image of the other one may be
 _SMALL = 0.005  # [rad], from a joint's rest
@@ -138,7 +139,22 @@ class StanceSearch:
         )
         lengths = np.array(self.lengths)
         bent = np.where(self.sprawled, _SPRAWLED[0], _BENT_OF_TWO if len(self.legs) == 2 else _BENT)
-        return float(max((hips - bent * lengths).mean(), (hips - _LONGEST * lengths).max()))
+        stretched = np.array([self._measure_stretched(index) for index in range(len(self.legs))])
+        highest = (
+            (hips - bent * lengths).mean(),
+            (hips - _LONGEST * lengths).max(),
+            (hips - _STRETCHED * stretched).max(),
+        )
+        return float(max(highest))
+
+    def _measure_stretched(self, index: int) -> float:
+        """Return how far below its hip a level sole is while the leg is stretched [m]; without a sole infinite."""
+        if not self.soles[index]:
+            return np.inf
+        leg = self.legs[index]
+        anchors, foot = self._place(leg, self.skeleton.rest[leg.joints])
+        bones = np.linalg.norm(np.diff(anchors[self.hips[index] :, ::2], axis=0), axis=1)  # seen from the side
+        return float(bones.sum() + anchors[-1, 2] - foot[2])
 
     def _solve(self, shift: float) -> Array:
         """Return positions of all joints, with feet shifted along x [m]."""
@@ -203,14 +219,18 @@ class StanceSearch:
             effort[~self.across[index]] *= 5.0  # legs that are not twisted
         aside = (0.2 if len(self.legs) == 2 else 0.05) * to_foot[1] + 3 * max(0.0, abs(to_foot[1]) - _ASIDE)
         below = 3 * (to_foot[0] - self.shift / length), aside
-        frame = self._find_frame(leg)
-        tilt = 3 * frame[2, :2] if self.soles[index] else np.zeros(2)
-        toe_out = (frame @ self.rest_frames[index].T)[1, 0] if len(self.legs) == 2 else 0.0
+        # From the rest on, where a sole is level: the axes of the file's frame may point anywhere.
+        turned = self._find_frame(leg) @ self.rest_frames[index].T
+        tilt = 3 * turned[2, :2] if self.soles[index] else np.zeros(2)
+        toe_out = turned[1, 0] if len(self.legs) == 2 else 0.0
         return np.array([level, *below, *tilt, toe_out, *buried, *bend, *effort])
 
     def _compare(self, index: int, angles: Array, image: Array) -> Array:
         """Return by how much a leg differs from the mirror image of the other one."""
         anchors, foot = self._place(self.legs[index], angles)
         effort = 1e-3 * (angles - self.skeleton.rest[self.legs[index].joints])
-        miss: Array = 10 * (np.vstack([anchors, foot]) - image).ravel() / self.lengths[index]
-        return np.array([*miss, *effort])
+        miss: Array = 10 * (np.vstack([anchors, foot]) - image) / self.lengths[index]
+        # Along its axis, the place of a joint is a choice of the file's.
+        axes = self.skeleton.axes(self.legs[index].joints)
+        miss[:-1] -= np.sum(miss[:-1] * axes, axis=1, keepdims=True) * axes
+        return np.array([*miss.ravel(), *effort])

@@ -25,9 +25,16 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 @pytest.mark.slow_except("walk")
-@pytest.mark.parametrize("task", ["walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk"])
+@pytest.mark.parametrize("task", ["walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk"])
 def test_sound_declarations(task):
     assert found(task, "RL120") == set()
+
+
+@pytest.mark.slow
+def test_robots_that_are_drawn_with_unequal_sides(rlctl):
+    """The motors of both sides draw their own values: the robots differ, and all of them together are symmetric."""
+    done = rlctl("check-env", "mini-walk", "--select", "RL120", "--set", "randomize=true")
+    assert (done.returncode, "no findings" in done.stdout) == (0, True)
 
 
 @pytest.mark.slow_except(first=1)

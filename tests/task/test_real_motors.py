@@ -223,6 +223,24 @@ def test_one_world_is_a_row_of_a_batch_to_the_bit(pendulum):
         assert np.array_equal(np.array(rows)[:, world], alone)
 
 
+@pytest.mark.parametrize("worlds", [None, 2])
+def test_a_motor_has_its_own_inertia_whatever_its_joint_had_before(tmp_path, worlds):
+    (tmp_path / "pendulum.xml").write_text(PENDULUM)
+    speeds = []
+    for armature in (None, 0.05):
+        with closing(MujocoSim(control_dt=0.02, substeps=4, worlds=worlds)) as sim:
+            body = sim.load("arm", tmp_path / "pendulum.xml", fixed=True)
+            if armature is not None:
+                body.set_drives(50.0, 1.0, armature=armature)
+            body.set_motors(SERVO)
+            sim.save()
+            body.drive_to(np.full_like(body.joint_positions, 1.0))
+            sim.step()
+            speeds.append(body.joint_velocities.copy())
+    assert speeds[0].min() > 0.1
+    assert speeds[0].tolist() == speeds[1].tolist()
+
+
 @pytest.mark.parametrize("worlds", [None, 3])
 def test_a_reset_restores_all(pendulum, worlds):
     sim, body = pendulum(FULL, worlds)

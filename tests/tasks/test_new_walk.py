@@ -17,6 +17,7 @@ from rlctl.tasks import new
 from rlctl.tasks.legs import Skeleton, find_legs
 from rlctl.tasks.stance import StanceSearch
 from rlctl_locomotion.humanoid_walk import SOLE, HumanoidWalk
+from rlctl_locomotion.mini_walk import MiniWalk
 from tests.tasks.test_new import run
 
 LEG = """<body name="{leg}_hip" pos="{x} {y} 0"><joint name="{leg}_hip" axis="1 0 0" range="-0.8 0.8"
@@ -144,21 +145,53 @@ def test_two_legs_that_only_turn_about_y(tmp_path, monkeypatch):
     assert np.isfinite(reward)
 
 
-@pytest.mark.slow
-def test_sprawled_legs_stand_to_the_sides():
-    """The ant's hips turn about z: all feet are level, farther out than the hips, and the body is off the ground."""
+@contextlib.contextmanager
+def search_stance(model):
+    """Give the skeleton of a model, its legs and the stance that is found, in which it is placed."""
     with contextlib.closing(MujocoSim(control_dt=0.02, substeps=4)) as sim:
-        skeleton = Skeleton(
-            sim.load("robot", Path(__file__).parents[2] / "plugins/rlctl_locomotion/models/mujoco/ant.xml")
-        )
+        skeleton = Skeleton(sim.load("robot", model))
         legs, mirror = find_legs(skeleton)
         stance = StanceSearch(skeleton, legs, mirror).find()
         skeleton.place(stance.positions)
+        yield skeleton, legs, stance
+
+
+@pytest.mark.slow
+def test_sprawled_legs_stand_to_the_sides():
+    """The ant's hips turn about z: all feet are level, farther out than the hips, and the body is off the ground."""
+    with search_stance(HumanoidWalk.model.parent / "mujoco/ant.xml") as (skeleton, legs, stance):
         feet = np.array([skeleton.touch(leg.foot) for leg in legs])
     assert (len(legs), [leg.other for leg in legs]) == (4, [3, 2, 1, 0])
     assert np.ptp(feet[:, 2]) < 0.01
     assert np.linalg.norm(feet[:, :2], axis=1).min() > 0.6
     assert stance.clearance > 0.1
+
+
+# What files of CAD programs have: the axes of a link's frame point anywhere, and a joint is anywhere along its axis.
+OTHER_FRAMES = {
+    'name="right_knee"': 'name="right_knee" pos="0 0.03 0"',
+    'name="right_foot"': 'name="right_foot" euler="1.5708 0 0"',
+    'name="left_foot"': 'name="left_foot" euler="1.5708 0 0"',
+    'pos="0.005 0 -0.022" size="0.05 0.028 0.008"': 'pos="0.005 -0.022 0" size="0.05 0.008 0.028"',  # of the feet
+}
+
+
+@pytest.mark.slow
+def test_the_stance_of_a_robot_with_long_feet_whatever_the_frames_of_its_file(tmp_path):
+    text = MiniWalk.model.read_text()
+    with search_stance(MiniWalk.model) as (_, legs, stance):
+        left, right = (stance.positions[leg.joints] for leg in legs)
+    hip_yaw, hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll = left
+    assert (hip_yaw, hip_roll, ankle_roll) == (0.0, 0.0, 0.0)
+    assert knee > 0.4  # although the feet, pointing down, make the legs longer by a third
+    assert hip_pitch + knee + ankle_pitch == pytest.approx(0.0, abs=0.01)  # the soles are level
+    assert right.tolist() == left.tolist()
+    for before, after in OTHER_FRAMES.items():
+        assert before in text
+        text = text.replace(before, after)
+    (tmp_path / "mini.xml").write_text(text)
+    with search_stance(tmp_path / "mini.xml") as (_, _, other):
+        assert other.positions == pytest.approx(stance.positions, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -220,6 +253,15 @@ def test_what_cannot_be_is_said(tmp_path, monkeypatch, before, after, note):
     file = write_dog(tmp_path)
     file.write_text(file.read_text().replace(before, after))
     assert re.search(note, new.create("odd-dog", model="dog.xml", walk=True).summary)
+
+
+@pytest.mark.slow
+def test_a_floor_in_the_file_is_no_part_of_the_robots_volume(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = write_dog(tmp_path)
+    floor = '<body name="floor"><geom type="plane" size="0 0 1"/></body></worldbody>'
+    file.write_text(file.read_text().replace("</worldbody>", floor))
+    assert "less than air" not in new.create("floored-dog", model="dog.xml", walk=True).summary
 
 
 @pytest.mark.slow

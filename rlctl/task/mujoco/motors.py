@@ -169,8 +169,15 @@ class MujocoMotors(Body):
             self.parts.has_bias = self.parts.has_bias or motor.encoder_bias_rad != 0
 
     def _write_armature(self, armature: Array | None) -> None:
-        if armature is not None:
-            self._sim.model.dof_armature[self.parts.velocities] = armature
+        """Write that of `set_drives`; a real motor keeps its own."""
+        if armature is None:
+            return
+        real = self.parts.real
+        open_joints = [
+            joint for joint in range(len(armature)) if joint not in real or real[joint].armature_kgm2 is None
+        ]
+        dofs = np.arange(self._sim.model.nv)[self.parts.velocities]
+        self._sim.model.dof_armature[dofs[open_joints]] = armature[open_joints]
 
     def drive_to(
         self,
