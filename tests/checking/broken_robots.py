@@ -177,6 +177,11 @@ class RL607BoatTerms(Boat):
 
 class RL607CrawlerTermsOff(Crawler):
     def info(self, success):
+        return {**super().info(success), "reward_terms": {"forward": max(self.forward(), 0.0)}}
+
+
+class RL607CrawlerRawTerms(Crawler):
+    def info(self, success):
         return {**super().info(success), "reward_terms": {"forward": 0.5 * self.forward()}}
 
 

@@ -34,6 +34,7 @@ CASES = [
     broken("RL507CrawlerFallsAsTruncated", "RL507", "warning", "RL507CrawlerFalls", slow=True),
     broken("RL607BoatTermsOff", "RL607", "warning", "RL607BoatTerms", slow=True),
     broken("RL607CrawlerTermsOff", "RL607", "warning", "RL607CrawlerTerms", slow=True),
+    broken("RL607CrawlerRawTerms", "RL607", "info", "RL607CrawlerTerms", slow=True),
     broken("RL615BoatMovingBuoy", "RL615", "warning", "RL615BoatFixedBuoy", slow=True),
     broken("RL615TankOtherWish", "RL615", "warning", "RL615TankOneWish", slow=True),
     broken("RL616BoatLateReward", "RL616", "warning", "Boat", slow=True),
