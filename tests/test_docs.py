@@ -297,7 +297,7 @@ def find_steps(page: str) -> list[str]:
 @pytest.mark.timeout(1800)
 def test_the_tutorial_works_from_the_first_page_to_the_last(tmp_path, rlctl, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (block,) = (block for block in find_blocks("yaml") if is_limits(block) and "shoulder" in block.text)
+    (block,) = (block for block in find_blocks("yaml") if is_limits(block) and "elbow: {" in block.text)
     Path("limits.yaml").write_text(block.text)
     for step in [step for page in TUTORIAL for step in find_steps(page)]:
         if step.startswith("rlctl "):
