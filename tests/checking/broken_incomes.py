@@ -113,5 +113,7 @@ class CartFindsLittle(CartSeeks):
 
 
 class RL605CartCountsFromTheStart(CartFindsLittle):
+    rlctl_ignore = {"RL114": "the distance at the start is hidden"}
+
     def reward(self, *_):
         return 5.0 * self.progress(self.last, self.distance())
