@@ -100,7 +100,6 @@ class RL618RoverLooksRound(RL618RoverLooks):
 class Drone(Robot):
     """A drone in a plane flies to a place; explicit Euler."""
 
-    rlctl_ignore = {"RL605": "being near is paid in each step, too"}
     limit = 100
 
     def start(self):
@@ -161,6 +160,7 @@ class RL618DroneTurnsBack(RL618DroneTurns):
 class RL617DroneLeaves(Drone):
     """Its flight ends where it leaves its area, which costs more than all steps to come."""
 
+    rlctl_ignore = {"RL605": "being near is paid in each step, too"}
     limit = 35  # [steps]
 
     def is_outside(self):
