@@ -13,7 +13,7 @@ CRATE = """<geom name="floor" type="plane" size="9 9 1"/><body name="crate" pos=
 class PusherTouches(Pusher):
     """It sees whether its crank touches the cube, which is too far away for most actions."""
 
-    rlctl_ignore = {**Pusher.rlctl_ignore, "RL110": "a consequence"}
+    rlctl_ignore = {**Pusher.rlctl_ignore, "RL110": "a consequence", "RL611": "chance does not push the cube so far"}
     placed = (0.4, 0.3, 0.03)
 
     def size(self):

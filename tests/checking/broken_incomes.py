@@ -45,6 +45,8 @@ class ArmPaysAll(PaysAll, RL605ArmEndsIncome): ...
 
 
 class RL605ReacherEndsIncome(EndsIncome, Reacher):
+    rlctl_ignore = {**EndsIncome.rlctl_ignore, "RL606": "a consequence"}
+
     def draw_goal(self):
         direction = self.np_random.normal(size=3)
         return np.array(self.hand()[4]) + 0.3 * direction / np.linalg.norm(direction)
@@ -70,6 +72,7 @@ class RoverFindsLittle(PaysAll, RL605RoverRestsNear):
 
 
 class RL605ArmRestsNear(RL605ArmEndsIncome):
+    rlctl_ignore = {**EndsIncome.rlctl_ignore, "RL611": "its goals are too small for random actions"}
     bonus = 5.0
 
     def succeeds(self):
@@ -110,5 +113,7 @@ class CartFindsLittle(CartSeeks):
 
 
 class RL605CartCountsFromTheStart(CartFindsLittle):
+    rlctl_ignore = {"RL114": "the distance at the start is hidden"}
+
     def reward(self, *_):
         return 5.0 * self.progress(self.last, self.distance())

@@ -52,6 +52,8 @@ class RL706CrawlerOnePercent(Crawler):
 
 
 class RL706PusherOnePercent(Pusher):
+    rlctl_ignore = {**Pusher.rlctl_ignore, "RL611": "a consequence"}
+
     def target(self, action):
         return super().target(0.01 * action)
 

@@ -17,6 +17,7 @@ BALL = """<body name="ball" pos="-.5 -.5 .03"><freejoint/>
 class PusherFar(PusherMeasures):
     """Its cube is where the crank does not reach it."""
 
+    rlctl_ignore = {**PusherMeasures.rlctl_ignore, "RL611": "the crank does not reach the cube"}
     placed = (0.9, 0.5, 0.03)
 
     def info(self, success):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, mark_slow
+from tests.checking.judging import case, check_case, found, mark_slow
 
 pytest.importorskip("mujoco")
 
@@ -36,3 +36,9 @@ CASES = [
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
+
+
+@pytest.mark.slow
+def test_a_robot_that_drifts_away_from_where_it_began_does_not_rest_there():
+    # A part of the observation is 0, as is the place of the drone in its first steps.
+    assert found(f"{SIGNS}:DroneThrottles", "RL605") == set()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings, mark_slow
+from tests.checking.judging import case, check_case, findings, found, mark_slow
 
 pytest.importorskip("mujoco")
 
@@ -45,3 +45,9 @@ def test_a_robot_that_always_begins_with_the_same_heading_is_an_info():
     assert finding.severity == "info"
     # North is along x: from backwards to forwards at 0.5 m/s.
     assert finding.evidence["value"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_bumps_are_no_level_ground():
+    # MuJoCo's models of tasks list which geoms touch, in pairs.
+    assert found("walk-rough", "RL123") == set()

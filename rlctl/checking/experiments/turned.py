@@ -90,6 +90,7 @@ def _is_level(model: Any, data: Any) -> bool:
     """Say whether all of the world is level planes, and one robot is free."""
     is_static = model.body_weldid == 0
     touches = (model.geom_contype | model.geom_conaffinity).astype(bool)
+    touches[np.concatenate([model.pair_geom1, model.pair_geom2])] = True  # Some models list pairs instead.
     static = np.flatnonzero(is_static[model.geom_bodyid] & touches)
     is_plane = all(model.geom_type[geom] == PLANE and data.geom_xmat[geom][8] > 1 - 1e-9 for geom in static)
     roots = {int(root) for root in model.body_rootid[~is_static]}

@@ -117,6 +117,9 @@ def _measure_income(trials: GoalTrials, source: Source, seed: int) -> Income | N
         is_still = not resting.has_ended and np.linalg.norm(resting.read(source) - place) <= STILL * distance
         # What is paid for a change of the distance is paid once, when the goal is moved.
         late = min(step.reward for step in steps[RESTING_STEPS // 2 :]) if is_still else 0.0
+        # A source that is constant is where a robot begins, and not where it is now.
+        if is_still and not resting.step(place).succeeds:
+            return None
         return Income(seed, late, distance, success.reward)
     return None
 
