@@ -133,7 +133,7 @@ def _list_subtractions(function: ast.FunctionDef) -> Iterator[int]:
 
 
 def _is_reward(target: ast.expr) -> bool:
-    name = target.id if isinstance(target, ast.Name) else target.attr if isinstance(target, ast.Attribute) else ""
+    name = str(getattr(target, "id", getattr(target, "attr", "")))
     return bool(set(split_name(name)) & REWARD_WORDS)
 
 
