@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from rlctl.task.motion import MotionClip
 
+_ROUNDING = 1e-3
+"""[rad^2], more than the products of matrices are rounded by."""
+
 
 class Style:
     """The rows of clips in no order: a robot has the style where its joints are near any row, whenever that is.
@@ -33,8 +36,8 @@ class Style:
             index, sign = np.abs(other_side) - 1, np.sign(other_side)
             both, signs = np.concatenate([index, index + len(index)]), np.concatenate([sign, sign])
             table = np.concatenate([table, signs * table[:, both]])
-        self._table = table.astype(np.float32)
-        self._lengths = np.square(self._table).sum(axis=1)
+        self._table, self._rough = table, table.astype(np.float32)
+        self._lengths = np.square(self._rough).sum(axis=1)
 
     def _join(self, positions: NDArray[np.float64], velocities: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.concatenate([positions, self.horizon_s * velocities], axis=1)
@@ -44,8 +47,13 @@ class Style:
 
         Positions [rad] and velocities [rad/s] have the shape (worlds, joints).
         """
-        now = self._join(positions, velocities).astype(np.float32)
-        # |a - b|^2 = |b|^2 - 2 a b + |a|^2: one product of matrices for all worlds and rows.
-        squares = (self._lengths - 2.0 * now @ self._table.T).min(axis=1) + np.square(now).sum(axis=1)
-        found: NDArray[np.float64] = np.sqrt(np.maximum(squares, 0.0) / positions.shape[1]).astype(np.float64)
+        now = self._join(positions, velocities)
+        # |a - b|^2 = |b|^2 - 2 a b + |a|^2: one product of matrices for all worlds and rows. Its last bits depend on
+        # the number of worlds, so the rows that may be the nearest are compared again, each for itself.
+        rough = self._lengths - 2.0 * now.astype(np.float32) @ self._rough.T
+        is_far = rough > rough.min(axis=1, keepdims=True) + _ROUNDING  # false for a world that is not finite
+        worlds, rows = np.nonzero(~is_far)
+        squares = np.square(now[worlds] - self._table[rows]).sum(axis=1)
+        nearest = np.minimum.reduceat(squares, np.flatnonzero(np.diff(worlds, prepend=-1)))
+        found: NDArray[np.float64] = np.sqrt(nearest / positions.shape[1])
         return found

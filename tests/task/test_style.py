@@ -48,6 +48,22 @@ def test_clips_of_other_rates_and_joint_orders():
     assert style.measure(np.array([[0.5, 0.06]]), np.array([[0.0, 1.0]])) == pytest.approx(0.0, abs=1e-3)
 
 
+def test_a_world_has_the_same_bits_among_others():
+    rng = np.random.default_rng(0)
+    style = Style([make_clip(rng.normal(size=(500, 2)))], NAMES, 0.02, OTHER_SIDE)
+    positions, velocities = rng.normal(size=(2, 64, 2))
+    together = style.measure(positions, velocities)
+    alone = [style.measure(positions[k : k + 1], velocities[k : k + 1])[0] for k in range(64)]
+    assert together.tolist() == alone
+
+
+def test_a_world_that_is_not_finite_stays_alone():
+    positions = np.array([[np.nan, 0.5], [0.1, 0.5]])
+    found = Style([RAMP], NAMES, 0.02).measure(positions, np.array([[1.0, 0.0], [1.0, 0.0]]))
+    assert np.isnan(found[0])
+    assert found[1] == pytest.approx(0.0, abs=1e-6)
+
+
 def test_a_clip_that_lacks_a_joint():
     with pytest.raises(TaskError, match="no column of the joint 'middle'"):
         Style([RAMP], ["middle"], 0.02)
