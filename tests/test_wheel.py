@@ -96,9 +96,10 @@ def test_the_wheels_train_reach_from_an_empty_folder(wheels, tmp_path):
         *((name, "ppo", None) for name in ("reach", "reach-batch", "pick", "place")),
         *(
             (name, "ppo", None)
-            for name in ("walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk")
+            for name in ("walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk", "humanoid-bow")
         ),
         *((name, "tqc", None) for name in ("ant", "biped", "half-cheetah", "hopper", "humanoid", "walker2d")),
+        ("quadruped-bow", "ppo", None),
         *((name, "sac", None) for name in ("biped-3d", "quadruped", "reach-sparse")),
         *((name, "sac", None) for name in ("kuka-grasp", "gear-arm", "peg-insert", "screw-drive")),
     }
