@@ -83,6 +83,7 @@ def _read_json(path: Path, text: str, joints: int) -> RawClip:
     for number, frame in enumerate(frames):
         if len(frame) != len(frames[0]) or not all(isinstance(value, int | float) for value in frame):
             raise UsageError(f"--motion {path}: frame {number} is not a row of {len(frames[0])} numbers, as the first")
+    _check_count(path, len(frames))
     raw = _split_columns(path, np.array(frames, np.float64), joints)
     duration = content.get("FrameDuration")
     if isinstance(duration, int | float) and duration > 0:
@@ -98,6 +99,7 @@ def _read_csv(path: Path, text: str, joints: int) -> RawClip:
     first = [part.strip() for part in lines[0].split(comma)]
     has_names = not all(map(_is_number, first))
     rows = np.array(list(_read_rows(path, lines, comma, len(first), start=int(has_names))))
+    _check_count(path, len(rows))
     return _name_columns(path, first, rows) if has_names else _split_columns(path, rows, joints)
 
 
@@ -195,6 +197,7 @@ def _read_npz(path: Path) -> RawClip:
     frames = len(joints) if joints.ndim == 2 else 0
     if joints.ndim != 2 or position.shape != (frames, 3) or quaternions.shape != (frames, 4):
         raise UsageError(f"--motion {path}: joints, positions and quaternions of shapes {shapes} do not fit together")
+    _check_count(path, frames)
     position, quaternions, joints = (np.asarray(values, np.float64) for values in (position, quaternions, joints))
     raw = RawClip(position, quaternions, joints)
     if source.startswith("body_"):
@@ -208,9 +211,12 @@ def _read_npz(path: Path) -> RawClip:
     return raw
 
 
+def _check_count(path: Path, frames: int) -> None:
+    if frames < LEAST_FRAMES:
+        raise UsageError(f"--motion {path}: {frames} frames; a clip has at least {LEAST_FRAMES}")
+
+
 def _check_numbers(path: Path, raw: RawClip) -> None:
-    if len(raw.joints) < LEAST_FRAMES:
-        raise UsageError(f"--motion {path}: {len(raw.joints)} frames; a clip has at least {LEAST_FRAMES}")
     table = np.column_stack([raw.root_position, raw.quaternions, raw.joints])
     bad = ~np.isfinite(table)
     if bad.any():

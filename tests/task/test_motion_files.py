@@ -117,6 +117,15 @@ def test_json_that_is_no_clip(tmp_path, content, problem):
         read(write_json(tmp_path, content))
 
 
+@pytest.mark.parametrize("rows", [0, 1, 2])
+def test_a_table_of_names_and_hardly_a_row(tmp_path, rows):
+    header = "time,root_x,root_y,root_z,root_qx,root_qy,root_qz,root_qw,hip_joint"
+    lines = [header, *["0,0,0,1,0,0,0,1,0.1"] * rows]
+    (tmp_path / "clip.csv").write_text("\n".join(lines))
+    with pytest.raises(UsageError, match=f"{rows} frames; a clip has at least 3"):
+        read(str(tmp_path / "clip.csv"))
+
+
 def test_a_time_before_columns_without_names(tmp_path):
     rows = np.column_stack([np.arange(4) / 60, make_rows()])
     motion, (note, *_) = read(write(tmp_path, rows, "clip.csv"))
