@@ -6,6 +6,7 @@ import math
 import numpy as np
 
 from rlctl.checking.experiments.attributes import RATES, AttributeLog, Numbers
+from rlctl.checking.rule import NotApplicable
 from rlctl.checking.term_names import split_name
 
 SUBSTEP_WORDS = {"substeps", "substep", "decimation", "skip", "frameskip", "repeat", "inner"}
@@ -32,10 +33,15 @@ class StepTimes:
         return round(self.control_s / self.physics_s)
 
 
-def find_step_times(log: AttributeLog) -> StepTimes | None:
-    """Return the times of a robot; None where they are not known, and where each step has one step of the physics."""
+def require_step_times(log: AttributeLog) -> StepTimes:
+    """Return the times of a robot.
+
+    Raises `NotApplicable` where they are not known, and where each step has one step of the physics.
+    """
     times = _read_engine(log) if math.isfinite(log.physics_s) else _read_declared(log)
-    return times if times is not None and times.substeps > 1 else None
+    if times is None or times.substeps <= 1:
+        raise NotApplicable("no step has several steps of the physics, as far as it is known")
+    return times
 
 
 def _read_engine(log: AttributeLog) -> StepTimes | None:

@@ -9,8 +9,8 @@ import numpy as np
 from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.records import Records
-from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
-from rlctl.checking.step_times import StepTimes, find_step_times, words_of
+from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.step_times import StepTimes, require_step_times, words_of
 from rlctl.checking.transitions import find_float_leaves, find_unit_pairs
 from rlctl.checking.worlds import Array
 
@@ -61,9 +61,7 @@ class _Clock:
 @judges_records(RULE, *RECORDING, "attributes")
 def _find_wrong_clocks(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
-    times = find_step_times(log)
-    if times is None:
-        raise NotApplicable("no step has several steps of the physics, as far as it is known")
+    times = require_step_times(log)
     limit = _find_limit(records)
     found = [
         finding for clock in _find_clocks(records, log) for finding in _judge_clock(clock, log.declared, times, limit)

@@ -11,8 +11,8 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog, Numbers
 from rlctl.checking.records import Records
 from rlctl.checking.rewards import RAW_TERMS, TERMS
-from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
-from rlctl.checking.step_times import StepTimes, find_rates, find_step_times
+from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.step_times import StepTimes, find_rates, require_step_times
 
 RULE = Rule(
     "RL827",
@@ -48,9 +48,7 @@ class _Form:
 @judges_records(RULE, "attributes")
 def _find_wrong_accelerations(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
-    times = find_step_times(log)
-    if times is None:
-        raise NotApplicable("no step has several steps of the physics, as far as it is known")
+    times = require_step_times(log)
     speeds = _list_speeds(log)
     steps = np.flatnonzero(log.is_step)
     if len(steps) < FEWEST_STEPS:
