@@ -21,7 +21,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,27 +64,48 @@ class Curve:
 
 def measure(task: str, tool: str, seed: int, limit_minutes: float) -> Curve:
     """Train until the tool ends or the time is over; raises `RuntimeError` if it is missing or fails."""
-    version = _read_version(tool)
+    version = read_version(tool)
     folder = (FOLDER / f"{task}_{tool}_{seed}").resolve()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     command, read = TRAINERS[tool](task, seed, folder)
-    shown = f"{_NAMES[command[0]]} {shlex.join(command[1:])}".replace(str(folder), "FOLDER")
-    curve = Curve(task, tool, seed, version, shown, [], [])
-    log = folder / "log.txt"
+    evaluations = follow(command, read, folder / "log.txt", limit_minutes)
+    minutes, scores = ([row[part] for row in evaluations] for part in (0, 1))
+    return Curve(task, tool, seed, version, describe_command(command, folder), minutes, scores)
+
+
+def describe_command(command: list[str], folder: Path) -> str:
+    """Return a command as the page shows it, with the names of its Python and its folder."""
+    return f"{_NAMES[command[0]]} {shlex.join(command[1:])}".replace(str(folder), "FOLDER")
+
+
+def follow(
+    command: list[str], read: Callable[[], list[float]], log: Path, limit_minutes: float
+) -> list[tuple[float, float]]:
+    """Run a training until it ends or the time is over; return when each evaluation was seen [min], and its score.
+
+    Raises `RuntimeError` if it fails.
+    """
+    evaluations: list[tuple[float, float]] = []
     began = time.monotonic()
+
+    def add_new() -> None:
+        minutes = (time.monotonic() - began) / 60
+        evaluations.extend((minutes, score) for score in read()[len(evaluations) :])
+
     with log.open("wb") as output, _start(command, output) as process:
         while process.poll() is None and time.monotonic() - began < 60 * limit_minutes:
             time.sleep(_POLL_S)
-            _add_new(curve, read(), (time.monotonic() - began) / 60)
+            add_new()
         was_stopped = process.poll() is None
-    _add_new(curve, read(), (time.monotonic() - began) / 60)
+    add_new()
     if not was_stopped and process.returncode != 0:
-        raise RuntimeError(f"{tool} {task}: exit code {process.returncode}\n{log.read_text()[-2000:]}")
-    return curve
+        raise RuntimeError(f"{shlex.join(command)}: exit code {process.returncode}\n{log.read_text()[-2000:]}")
+    return evaluations
 
 
-def _read_version(tool: str) -> str:
+def read_version(tool: str) -> str:
+    """Return the package of a tool and its version; raises `RuntimeError` if it is missing."""
     package, python = PACKAGES[tool], os.environ[PEERS[tool]] if tool in PEERS else sys.executable
     ask = f"import importlib.metadata; print(importlib.metadata.version({package!r}))"
     try:
@@ -105,17 +126,11 @@ def _start(command: list[str], output: Any) -> Iterator[subprocess.Popen[bytes]]
             process.wait()
 
 
-def _add_new(curve: Curve, scores: list[float], minutes: float) -> None:
-    for score in scores[len(curve.scores) :]:
-        curve.minutes.append(minutes)
-        curve.scores.append(score)
-
-
 def write_page(curves: list[Curve], limit_minutes: float) -> None:
     """Write the table of all curves."""
     lines = [
         "# How long a training takes, next to RL Baselines3 Zoo and sbx\n",
-        f"Written by `make compare` on {_describe_machine()}, {', '.join(dict.fromkeys(c.version for c in curves))}.",
+        f"Written by `make compare` on {describe_machine()}, {', '.join(dict.fromkeys(c.version for c in curves))}.",
         "One training at a time; minutes from the start of the process, evaluations included.",
         "rl-zoo3 has its own tuned hyperparameters (TQC), for `reach` those of an earlier recipe of rlctl (PPO).",
         "sbx has TQC [256, 256] with the zoo's learning rate, batch, gamma and tau, for `reach` PPO.",
@@ -153,7 +168,8 @@ def _find_peers_ahead(curves: list[Curve]) -> list[Curve]:
     return [c for c in curves if c.minutes_to(PUBLISHED[c.task]) < min(ours[c.task], default=0.0)]
 
 
-def _describe_machine() -> str:
+def describe_machine() -> str:
+    """Return cores, processor and the versions of torch and numpy."""
     with open("/proc/cpuinfo") as info:
         model = next((line.partition(":")[2].strip() for line in info if line.startswith("model name")), "")
     versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("torch", "numpy"))

@@ -57,7 +57,7 @@ def train_zoo(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[
         *("--eval-freq", str(_ZOO_EVERY[algo]), "--eval-episodes", str(EPISODES), "--save-freq", "-1"),
         *("-f", str(folder), "--device", "cpu"),
     ]
-    return command, lambda: _read_evaluations(task, folder)
+    return command, lambda: read_evaluations(folder, SCORES[task])
 
 
 def _read_zoo_settings(task: str) -> tuple[str, dict[str, Any]]:
@@ -71,10 +71,11 @@ def _read_zoo_settings(task: str) -> tuple[str, dict[str, Any]]:
     return "tqc", settings
 
 
-def _read_evaluations(task: str, folder: Path) -> list[float]:
+def read_evaluations(folder: Path, score: str = "return") -> list[float]:
+    """Return the means of the evaluations that Stable-Baselines3's `EvalCallback` has written below a folder."""
     for file in folder.rglob("evaluations.npz"):
         with contextlib.suppress(OSError, ValueError, EOFError), np.load(file) as arrays:  # while it is written
-            return [float(mean) for mean in arrays[_IN_NPZ[SCORES[task]]].mean(axis=1)]
+            return [float(mean) for mean in arrays[_IN_NPZ[score]].mean(axis=1)]
     return []
 
 
@@ -90,7 +91,7 @@ if __name__ == "__main__":
     callback = EvalCallback(
         make_vec_env(job["env"]), n_eval_episodes=job["episodes"], eval_freq=every, log_path=job["folder"], verbose=0
     )
-    model = getattr(sbx, job["algo"])("MlpPolicy", env, seed=job["seed"], **job["settings"])
+    model = getattr(sbx, job["algo"])(job.get("policy", "MlpPolicy"), env, seed=job["seed"], **job["settings"])
     model.learn(job["steps"], callback=callback)
 """
 _SBX_TQC = {**OFF_POLICY, "gradient_steps": 32, "policy_kwargs": {"net_arch": [256, 256]}}
@@ -111,9 +112,14 @@ def train_sbx(task: str, seed: int, folder: Path) -> tuple[list[str], Callable[[
         "every": steps // 50,
         "folder": str(folder),
     }
+    return write_sbx(job, folder), lambda: read_evaluations(folder, SCORES[task])
+
+
+def write_sbx(job: dict[str, Any], folder: Path) -> list[str]:
+    """Write the script that trains with sbx; return the command of a training."""
     script = folder / "train.py"
     script.write_text(_SBX)
-    return [os.environ["RLCTL_SBX"], str(script), json.dumps(job)], lambda: _read_evaluations(task, folder)
+    return [os.environ["RLCTL_SBX"], str(script), json.dumps(job)]
 
 
 PEERS = {"rl-zoo3": "RLCTL_ZOO", "sbx": "RLCTL_SBX"}
