@@ -79,7 +79,7 @@ class AskedMotors:
         motor, play = self.motor, values.get("backlash_rad", 0.0)
         where = f'body="{body}"' + (f", joints={joints}" if joints else "")
         lines = [_write_event("torque_constant", where, "factor", 1.0, _CONSTANTS)]
-        lines.append(f'"motor_bias": Event("reset", events.motor_bias, {where}, bias_rad=(-{_BIAS}, {_BIAS})),')
+        lines.append(_write_range("motor_bias", where, "bias_rad", 0.0, (-_BIAS, _BIAS)))
         if motor.voltage_v is not None:
             lines.append(_write_event("voltage", where, "voltage_v", motor.voltage_v, _VOLTAGES))
         if motor.coulomb_friction_nm is not None:
@@ -90,8 +90,14 @@ class AskedMotors:
 
 
 def _write_event(name: str, where: str, key: str, value: float, factors: tuple[float, float]) -> str:
-    low, high = (write_number(float(f"{factor * value:.3g}"), "g") for factor in factors)
-    return f'"{name}": Event("reset", events.{name}, {where}, {key}=({low}, {high})),'
+    return _write_range(name, where, key, value, (factors[0] * value, factors[1] * value))
+
+
+def _write_range(name: str, where: str, key: str, nominal: float, bounds: tuple[float, float]) -> str:
+    """Return an event whose range grows from the nominal value to its bounds, with the level of a recipe's stage."""
+    value, low, high = (write_number(float(f"{number:.3g}"), "g") for number in (nominal, *bounds))
+    ends = f'{{"from": ({value}, {value}), "to": ({low}, {high})}}'
+    return f'"{name}": Event("reset", events.{name}, {where}, {key}={ends}),'
 
 
 def _read_angle(text: str) -> float:

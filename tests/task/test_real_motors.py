@@ -150,6 +150,18 @@ def test_until_the_first_command_arrives_a_motor_holds_its_joint(pendulum):
     assert positions[3] > 1.001
 
 
+@pytest.mark.parametrize("worlds", [None, 2])
+@pytest.mark.parametrize("changes", [{}, {"integral_nm_per_rads": 50.0}, {"encoder_bias_rad": 0.1}])
+def test_without_a_command_a_motor_holds_its_joint_where_it_was_placed(pendulum, worlds, changes):
+    sim, body = pendulum(IDEAL, worlds, gravity=0.0, **changes)
+    body.set_joints(np.full_like(body.joint_positions, 1.0))
+    if worlds is not None:
+        body.set_joints(np.array([[0.5]]), worlds=np.array([1]))
+    sim.step()
+    expected = [1.0] if worlds is None else [1.0, 0.5]
+    assert body.joint_positions.ravel() == pytest.approx(expected, abs=1e-9)
+
+
 def test_an_encoder_bias_shifts_what_is_read_and_what_is_driven_to(pendulum):
     sim, body = pendulum(IDEAL, gravity=0.0, encoder_bias_rad=0.1)
     body.set_joints(np.array([0.5]))

@@ -320,6 +320,8 @@ class MujocoBody(MujocoMotors):
         else:
             places[rows[:, None], self._positions] = positions
             speeds[rows[:, None], self._velocities] = 0.0 if velocities is None else velocities
+        if self.parts.real:
+            self.hold_at(positions, worlds)
         self._fields.touch(worlds)
 
     def _check(self, name: str, values: Any, shape: tuple[int, ...]) -> None:

@@ -107,6 +107,21 @@ class MujocoMotors(Body):
         """Let nothing drive the joints after a reset, until the next command."""
         self.parts.active.clear()
 
+    def hold_at(self, positions: Array, worlds: WorldIndex | None) -> None:
+        """Let real motors hold these positions of all joints [rad] until the next command: their controllers always act.
+
+        Without it a joint that is placed by a reset would be driven to 0 where physics runs before the first command.
+        """
+        joints = list(self.parts.real)
+        motors, rows = self._motors[joints], ... if worlds is None else worlds
+        gains = self._fields.model("actuator_gainprm")[rows][..., motors, STIFFNESS]
+        targets = np.asarray(positions)[..., joints]
+        controls = np.where(self._real.has_integral[joints], targets, gains * targets)
+        if worlds is None:
+            self._fields.data("ctrl")[..., motors] = controls
+        else:
+            self._fields.data("ctrl")[worlds[:, None], motors] = controls
+
     @property
     def joint_torques(self) -> Array:
         if self.parts.own_actuators:  # they may act on several joints
