@@ -18,6 +18,7 @@ _LARGEST = math.radians(20.0)
 """Play beyond which a typing mistake is more likely than a gear."""
 _VOLTAGES, _CONSTANTS, _FRICTIONS, _PLAYS = (0.85, 1.05), (0.9, 1.1), (0.5, 2.0), (0.0, 1.5)  # of the motor's own
 _BIAS = 0.02  # [rad]
+_OF_JOINTS = ("torque_constant", "motor_friction", "backlash")  # events that draw a number per joint that has no sign
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,38 +67,31 @@ class AskedMotors:
         entry, items = TABLE[self.name], [f'"{name}": {write_number(value, "g")}' for name, value in values.items()]
         unknown = [name for name in values if name != "backlash_rad"]
         guessed = f"; CHANGE: guesses are {', '.join(unknown)}" if unknown else ""
+        events = self._list_events(values, body, joints)
         return {
             "motor": write_string(self.name),
             "motor_comment": write_comment(f"From: {entry.source} ({entry.kind}). {entry.unknown}{guessed}."),
             "motor_values": SourceText(f"{{{', '.join(items)}}}"),
-            "motor_events": SourceText(
-                "\n".join(f"        {line}" for line in self._list_events(values, body, joints))
-            ),
+            "motor_events": SourceText("\n".join(f"        {line}" for line in events.values())),
+            "motor_factors": SourceText(", ".join(f'"events/{name}"' for name in _OF_JOINTS if name in events)),
         }
 
-    def _list_events(self, values: Mapping[str, float], body: str, joints: str) -> list[str]:
+    def _list_events(self, values: Mapping[str, float], body: str, joints: str) -> dict[str, str]:
+        """Return the source text of each event, whose range grows from the motor's value with a stage's level."""
         motor, play = self.motor, values.get("backlash_rad", 0.0)
+        ranges = {
+            "torque_constant": ("factor", 1.0, _CONSTANTS),
+            "voltage": ("voltage_v", motor.voltage_v, _VOLTAGES),
+            "motor_friction": ("coulomb_nm", motor.coulomb_friction_nm, _FRICTIONS),
+            "backlash": ("backlash_rad", play or None, _PLAYS),
+        }
+        texts = {"motor_bias": f'bias_rad={{"from": (0, 0), "to": (-{_BIAS}, {_BIAS})}}'}
+        for name, (key, value, factors) in ranges.items():
+            if value is not None:
+                own, low, high = (write_number(float(f"{factor * value:.3g}"), "g") for factor in (1.0, *factors))
+                texts[name] = f'{key}={{"from": ({own}, {own}), "to": ({low}, {high})}}'
         where = f'body="{body}"' + (f", joints={joints}" if joints else "")
-        lines = [_write_event("torque_constant", where, "factor", 1.0, _CONSTANTS)]
-        lines.append(_write_range("motor_bias", where, "bias_rad", 0.0, (-_BIAS, _BIAS)))
-        if motor.voltage_v is not None:
-            lines.append(_write_event("voltage", where, "voltage_v", motor.voltage_v, _VOLTAGES))
-        if motor.coulomb_friction_nm is not None:
-            lines.append(_write_event("motor_friction", where, "coulomb_nm", motor.coulomb_friction_nm, _FRICTIONS))
-        if play:
-            lines.append(_write_event("backlash", where, "backlash_rad", play, _PLAYS))
-        return lines
-
-
-def _write_event(name: str, where: str, key: str, value: float, factors: tuple[float, float]) -> str:
-    return _write_range(name, where, key, value, (factors[0] * value, factors[1] * value))
-
-
-def _write_range(name: str, where: str, key: str, nominal: float, bounds: tuple[float, float]) -> str:
-    """Return an event whose range grows from the nominal value to its bounds, with the level of a recipe's stage."""
-    value, low, high = (write_number(float(f"{number:.3g}"), "g") for number in (nominal, *bounds))
-    ends = f'{{"from": ({value}, {value}), "to": ({low}, {high})}}'
-    return f'"{name}": Event("reset", events.{name}, {where}, {key}={ends}),'
+        return {name: f'"{name}": Event("reset", events.{name}, {where}, {text}),' for name, text in texts.items()}
 
 
 def _read_angle(text: str) -> float:

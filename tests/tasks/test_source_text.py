@@ -83,6 +83,7 @@ CODE = {
     "motor_comment": "# From a page.",
     "motor_values": "{}",
     "motor_events": '        "voltage": 1,',
+    "motor_factors": '"events/backlash"',
     "inclined": " down",
     "towards_held": "+ 0",
     "both_sides": ", OTHER_SIDE",
