@@ -128,17 +128,14 @@ def _choose_lines(legged: _Legged) -> frozenset[str]:
     """Return which optional lines of the template the plugin has: those of a clock, and of a mirror image."""
     kind, is_mirrored = "clock" if legged.is_biped else "walk", bool(legged.gait.other_side)
     has_motors = legged.motors is not None
-    sees_more = legged.is_biped or has_motors  # its critic
     chosen = {
         kind: True,
         "aside": legged.is_biped and bool(legged.gait.aside),
         "motors": has_motors,
         "drives": not has_motors,
-        "privileged": sees_more,
         "mirror": is_mirrored,
         f"mirror_{kind}": is_mirrored,
-        "mirror_privileged": is_mirrored and sees_more,
-        "mirror_motors": is_mirrored and has_motors,
+        "mirror_motors": is_mirrored and has_motors and legged.is_biped,  # whose critic sees what was drawn
         "style": bool(legged.clips),
         f"style_{kind}": bool(legged.clips),
     }
