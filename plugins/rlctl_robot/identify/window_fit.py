@@ -10,19 +10,20 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rlctl.library_output import hide_instability
 from rlctl_robot.identify.log import Array
+from rlctl_robot.identify.readings import LINEAR, ReadingErrors, find_steps
 from rlctl_robot.identify.unknowns import UnknownValues
 from rlctl_robot.identify.windows import WindowPlayer
 
 _MOST_ITERATIONS = 60
-ENOUGH = 0.5  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
-_NEAR = 0.2  # relative decrease of the cost, below which derivatives hold for the next step too
-_DAMPINGS = (0.01, 0.1, 1.0, 10.0, 1000.0)  # factors of the last damping, tried in one batch
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-9, 1e6
-_LINEAR = 3.0  # standard deviations, beyond which an error counts linearly (Huber)
-_QUANTILE, _AT_QUANTILE = 0.9, 1.645  # of errors, and of a normal distribution
+ENOUGH = 0.1  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
+_REUSED = 10.0  # decrease of the cost, relative to the smallest to continue, above which derivatives may be old
+_NEAR = 0.1  # decrease of the cost per reading, below which derivatives hold for the next step too
+_DAMPINGS = (0.01, 0.3, 10.0, 1000.0)  # factors of the last damping, tried in one batch
+_STATE_DAMPINGS = (1e-3, 1.0, 1e3)  # of start states, of which each window takes the best
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3
 _POSITION_STEP, _VELOCITY_STEP = 2e-4, 2e-3  # [rad or m], [rad/s or m/s], for derivatives
-_FINEST = 1e-5  # [rad or m], of a measurement
 _TIE = 1e-6  # weight with which a start state stays where it is, relative to what its window says
 
 
@@ -80,6 +81,7 @@ class WindowFitter:
         """`positions` [rad or m] are the encoders', `velocities` a first guess; shape (rows, joints)."""
         self._player, self._unknowns, self._starts, self._steps = player, unknowns, starts, steps
         self._measured = np.stack([positions[start : start + steps + 1] for start in starts])
+        self._readings = ReadingErrors(find_steps(positions))
         self._first = (positions[starts], velocities[starts])
         self._lowest = unknowns.column("lowest")
         self._center, self._doubt = unknowns.column("first"), unknowns.column("doubt")
@@ -88,7 +90,7 @@ class WindowFitter:
         self._same_tree = trees[:, None] == trees
 
     def fit(self, vector: Array, report: Callable[[str], None], enough: float = ENOUGH) -> WindowFit:
-        """Return the best values near a first guess, shape (unknowns,); `enough` is the last step's decrease."""
+        """Return the best values near a first guess, shape (unknowns,); `enough` is the least decrease to go on for."""
         point = self._play([(np.maximum(vector, self._lowest), *self._first)])[0]
         damping, is_new = _FIRST_DAMPING, True
         derivatives = self._differentiate(point)
@@ -97,19 +99,22 @@ class WindowFitter:
             equations = self._form_equations(point, derivatives, noise)
             cost = self._compute_cost(point, noise)
             dampings = np.clip(damping * np.array(_DAMPINGS), _LEAST_DAMPING, _MOST_DAMPING)
-            candidates = self._play([self._step(point, equations, factor) for factor in dampings])
+            promised = self._promise_decrease(point, equations)
+            candidates = self._try_steps(point, equations, dampings, noise)
             costs = np.array([self._compute_cost(candidate, noise) for candidate in candidates])
             best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
             decrease = cost - float(costs[best])
             if decrease > 0:
                 point, damping = candidates[best], float(dampings[best])
             report(f"step {iteration + 1}: remaining error {np.sqrt(np.square(point.errors).mean()):.3g}")
+            if is_new and promised < enough:
+                break
             if is_new and decrease < enough:
-                if decrease > 0 or damping >= _MOST_DAMPING:
+                if damping >= _MOST_DAMPING:
                     break
                 damping = min(1000.0 * damping, _MOST_DAMPING)
                 continue
-            is_new = decrease > _NEAR * cost or decrease < enough
+            is_new = not _REUSED * enough < decrease < _NEAR * point.errors.size
             if is_new:
                 derivatives = self._differentiate(point)
         return self._finish(point, derivatives)
@@ -118,29 +123,23 @@ class WindowFitter:
         """Simulate all windows for several values and start states in one batch."""
         windows = len(self._starts)
         vectors = np.repeat(np.array([vector for vector, _, _ in starts]), windows, axis=0)
-        played = self._player.play(
-            self._unknowns.values(vectors),
-            np.tile(self._starts, len(starts)),
-            np.concatenate([positions for _, positions, _ in starts]),
-            np.concatenate([velocities for _, _, velocities in starts]),
-            self._steps,
-        )
+        with hide_instability():
+            played = self._player.play(
+                self._unknowns.values(vectors),
+                np.tile(self._starts, len(starts)),
+                np.concatenate([positions for _, positions, _ in starts]),
+                np.concatenate([velocities for _, _, velocities in starts]),
+                self._steps,
+            )
         errors = played.reshape(len(starts), *self._measured.shape) - self._measured
         return [_Point(*start, error) for start, error in zip(starts, errors, strict=True)]
 
     def _estimate_noise(self, errors: Array) -> Array:
-        """Return the standard deviation of each joint's errors, on which outliers have little influence."""
-        # Not the median: a joint that rests for most of the time must not make its motion an outlier.
-        middle = np.maximum(np.quantile(np.abs(errors), _QUANTILE, axis=(0, 1)) / _AT_QUANTILE, _FINEST)
-        clipped = np.clip(errors, -_LINEAR * middle, _LINEAR * middle)
-        noise: Array = np.maximum(np.sqrt(np.square(clipped).mean(axis=(0, 1))), _FINEST)
-        return noise
+        return self._readings.estimate_noise(errors.reshape(-1, errors.shape[-1]))
 
     def _compute_cost(self, point: _Point, noise: Array) -> float:
-        sizes = np.abs(point.errors / noise)
-        costs = np.where(sizes < _LINEAR, np.square(sizes) / 2, _LINEAR * sizes - _LINEAR**2 / 2)
         known = np.square((point.vector - self._center) / self._doubt).sum() / 2
-        return float(costs.sum() + known)
+        return float(self._readings.cost(point.errors, noise).sum() + known)
 
     def _differentiate(self, point: _Point) -> _Derivatives:
         """Compute all derivatives in one batch of worlds."""
@@ -171,10 +170,10 @@ class WindowFitter:
 
     def _form_equations(self, point: _Point, derivatives: _Derivatives, noise: Array) -> _Equations:
         """Return the normal equations at a point, with derivatives that were computed near it."""
-        sizes = np.abs(point.errors / noise)
-        weights = np.sqrt(np.where(sizes < _LINEAR, 1.0, _LINEAR / np.maximum(sizes, 1e-9))) / noise
+        slopes, curvatures = self._readings.derive(point.errors, noise)
+        weights = np.sqrt(curvatures)
         windows = len(self._starts)
-        errors = (point.errors * weights).reshape(windows, -1)
+        errors = (slopes / weights).reshape(windows, -1)
         of_values, of_states = (
             (part * weights[..., None]).reshape(windows, errors.shape[1], -1)
             for part in (derivatives.values, derivatives.states)
@@ -199,22 +198,57 @@ class WindowFitter:
         gradients = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
         return matrices, gradients, inverse
 
-    def _step(self, point: _Point, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
-        """Return the values and start states after a step of Levenberg and Marquardt within the values' bounds."""
-        matrices, gradients, inverse = self._reduce(equations, damping)
-        known = 1.0 / np.square(self._doubt)
-        matrix = matrices.sum(axis=0) + np.diag(known)
-        gradient = gradients.sum(axis=0) + known * (point.vector - self._center)
-        matrix = matrix + damping * np.diag(np.diag(equations.values.sum(axis=0)) + known)
-        change = _solve_bounded(matrix, gradient, self._lowest - point.vector)
-        pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
-        moved = -np.einsum("wst,wt->ws", inverse, pull)
+    def _try_steps(self, point: _Point, equations: _Equations, dampings: Array, noise: Array) -> list[_Point]:
+        """Return a point for each damping of the values, with the best start state of each window."""
+        inverses = [self._reduce(equations, damping)[2] for damping in _STATE_DAMPINGS]
+        starts = []
+        for damping in dampings:
+            change = self._change_values(point, equations, damping)
+            vector = np.maximum(point.vector + change, self._lowest)
+            pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
+            moves = [-np.einsum("wst,wt->ws", inverse, pull) for inverse in inverses]
+            starts += [(vector, *states) for states in self._propose_states(point, moves, noise)]
+        points = self._play(starts)
+        count = len(points) // len(dampings)
+        return [self._mix(points[begin : begin + count], noise) for begin in range(0, len(points), count)]
+
+    def _propose_states(self, point: _Point, moves: list[Array], noise: Array) -> list[tuple[Array, Array]]:
+        """Return start states to compare: after each of the moves, shape (windows, states), and with a joint reset."""
         joints = len(self._places)
-        return (
-            np.maximum(point.vector + change, self._lowest),
-            point.positions + moved[:, :joints],
-            point.velocities + moved[:, joints:],
+        proposed = [(point.positions + move[:, :joints], point.velocities + move[:, joints:]) for move in moves]
+        # A joint that rests has another minimum where it begins with a speed and stops: no small step leads out of it.
+        worst = self._readings.cost(point.errors, noise).sum(axis=1).argmax(axis=1)
+        is_worst = worst[:, None] == np.arange(joints)
+        first = [np.where(is_worst, *pair) for pair in zip(self._first, proposed[0], strict=True)]
+        return [*proposed, (first[0], first[1]), (first[0], np.where(is_worst, 0.0, first[1]))]
+
+    def _mix(self, points: list[_Point], noise: Array) -> _Point:
+        """Return points of the same values as one, each window with the start state of the least cost."""
+        costs = np.array([self._readings.cost(point.errors, noise).sum(axis=(1, 2)) for point in points])
+        best, windows = np.where(np.isfinite(costs), costs, np.inf).argmin(axis=0), np.arange(len(self._starts))
+        positions, velocities, errors = (
+            np.stack([getattr(point, name) for point in points])[best, windows]
+            for name in ("positions", "velocities", "errors")
         )
+        return _Point(points[0].vector, positions, velocities, errors)
+
+    def _change_values(self, point: _Point, equations: _Equations, damping: float) -> Array:
+        """Return the step of Levenberg and Marquardt of the values, within their bounds."""
+        matrix, gradient = self._collect(point, equations)
+        matrix = matrix + damping * np.diag(np.diag(matrix))
+        return _solve_bounded(matrix, gradient, self._lowest - point.vector)
+
+    def _promise_decrease(self, point: _Point, equations: _Equations) -> float:
+        """Return how much the cost would decrease with the best values if the errors were linear."""
+        matrix, gradient = self._collect(point, equations)
+        change = self._change_values(point, equations, 0.0)
+        return -float(gradient @ change + change @ matrix @ change / 2)
+
+    def _collect(self, point: _Point, equations: _Equations) -> tuple[Array, Array]:
+        """Return the normal equations of the values: those of all windows, and what was known before."""
+        matrices, gradients, _ = self._reduce(equations, 0.0)
+        known = 1.0 / np.square(self._doubt)
+        return matrices.sum(axis=0) + np.diag(known), gradients.sum(axis=0) + known * (point.vector - self._center)
 
     def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
         noise = self._estimate_noise(point.errors)
@@ -229,7 +263,13 @@ class WindowFitter:
         moved = moved - moved.mean(axis=0)
         measured = (1.0 - 1.0 / len(moved)) * np.square(moved).sum(axis=0)
         widen = np.sqrt(np.maximum(1.0, measured / np.diag(inverse)))
-        return WindowFit(point.vector, information, inverse * np.outer(widen, widen), noise)
+        # The noise is that of the best values and start states, and smaller than that of the true ones.
+        fitted = len(point.vector) + point.positions.size + point.velocities.size
+        freedom = point.errors.size / max(point.errors.size - fitted, 1)
+        spread = self._readings.spread(noise)
+        clipped = np.clip(point.errors, -LINEAR * spread, LINEAR * spread)
+        remaining = np.sqrt(np.square(clipped).mean(axis=(0, 1)))
+        return WindowFit(point.vector, information, freedom * inverse * np.outer(widen, widen), remaining)
 
 
 def _tie(matrices: Array) -> Array:
