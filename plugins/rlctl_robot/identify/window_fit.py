@@ -19,6 +19,7 @@ from rlctl_robot.identify.windows import WindowPlayer
 _MOST_ITERATIONS = 60
 ENOUGH = 0.1  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
 _REUSED = 10.0  # decrease of the cost, relative to the smallest to continue, above which derivatives may be old
+_UNSTABLE = 1e30  # cost of a simulation without finite positions
 _NEAR = 0.1  # decrease of the cost per reading, below which derivatives hold for the next step too
 _DAMPINGS = (0.01, 0.3, 10.0, 1000.0)  # factors of the last damping, tried in one batch
 _STATE_DAMPINGS = (1e-3, 1.0, 1e3)  # of start states, of which each window takes the best
@@ -99,8 +100,14 @@ class WindowFitter:
             equations = self._form_equations(point, derivatives, noise)
             cost = self._compute_cost(point, noise)
             dampings = np.clip(damping * np.array(_DAMPINGS), _LEAST_DAMPING, _MOST_DAMPING)
-            promised = self._promise_decrease(point, equations)
-            candidates = self._try_steps(point, equations, dampings, noise)
+            matrix, gradient = self._collect(point, equations)
+            change = _solve_bounded(matrix, gradient, self._lowest - point.vector)
+            promised = -float(gradient @ change + change @ matrix @ change / 2)
+            steps = [
+                _solve_bounded(matrix + factor * np.diag(np.diag(matrix)), gradient, self._lowest - point.vector)
+                for factor in dampings
+            ]
+            candidates = self._try_steps(point, equations, steps, noise)
             costs = np.array([self._compute_cost(candidate, noise) for candidate in candidates])
             best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
             decrease = cost - float(costs[best])
@@ -186,30 +193,17 @@ class WindowFitter:
             states_gradient=np.einsum("wip,wi->wp", of_states, errors),
         )
 
-    def _reduce(self, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
-        """Eliminate the start states: return each window's matrix and gradient of the values alone.
-
-        Their shapes are (windows, unknowns, unknowns) and (windows, unknowns).
-        """
-        size = equations.states.shape[-1]
-        inverse = np.asarray(np.linalg.inv(equations.states * (1.0 + damping * np.eye(size))), np.float64)
-        influence = equations.mixed @ inverse
-        matrices = equations.values - influence @ np.swapaxes(equations.mixed, 1, 2)
-        gradients = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
-        return matrices, gradients, inverse
-
-    def _try_steps(self, point: _Point, equations: _Equations, dampings: Array, noise: Array) -> list[_Point]:
-        """Return a point for each damping of the values, with the best start state of each window."""
-        inverses = [self._reduce(equations, damping)[2] for damping in _STATE_DAMPINGS]
+    def _try_steps(self, point: _Point, equations: _Equations, steps: list[Array], noise: Array) -> list[_Point]:
+        """Return a point for each step of the values, with the best start state of each window."""
+        inverses = [_invert(equations.states, damping) for damping in _STATE_DAMPINGS]
         starts = []
-        for damping in dampings:
-            change = self._change_values(point, equations, damping)
+        for change in steps:
             vector = np.maximum(point.vector + change, self._lowest)
             pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
             moves = [-np.einsum("wst,wt->ws", inverse, pull) for inverse in inverses]
             starts += [(vector, *states) for states in self._propose_states(point, moves, noise)]
         points = self._play(starts)
-        count = len(points) // len(dampings)
+        count = len(points) // len(steps)
         return [self._mix(points[begin : begin + count], noise) for begin in range(0, len(points), count)]
 
     def _propose_states(self, point: _Point, moves: list[Array], noise: Array) -> list[tuple[Array, Array]]:
@@ -217,10 +211,22 @@ class WindowFitter:
         joints = len(self._places)
         proposed = [(point.positions + move[:, :joints], point.velocities + move[:, joints:]) for move in moves]
         # A joint that rests has another minimum where it begins with a speed and stops: no small step leads out of it.
-        worst = self._readings.cost(point.errors, noise).sum(axis=1).argmax(axis=1)
-        is_worst = worst[:, None] == np.arange(joints)
+        costs = self._readings.cost(point.errors, noise).sum(axis=1)
+        is_worst = costs >= np.where(self._same_tree, costs[:, None], -np.inf).max(axis=-1)
         first = [np.where(is_worst, *pair) for pair in zip(self._first, proposed[0], strict=True)]
         return [*proposed, (first[0], first[1]), (first[0], np.where(is_worst, 0.0, first[1]))]
+
+    def _mix(self, points: list[_Point], noise: Array) -> _Point:
+        """Return points of the same values as one, each window and tree with the start state of the least cost."""
+        costs = np.array([self._readings.cost(point.errors, noise).sum(axis=1) for point in points])
+        costs = np.where(np.isfinite(costs), costs, _UNSTABLE) @ self._same_tree  # of each joint's tree
+        best, windows, joints = costs.argmin(axis=0), np.arange(len(self._starts))[:, None], np.arange(costs.shape[-1])
+        positions, velocities = (
+            np.stack([getattr(point, name) for point in points])[best, windows, joints]
+            for name in ("positions", "velocities")
+        )
+        errors = np.stack([np.swapaxes(point.errors, 1, 2) for point in points])[best, windows, joints]
+        return _Point(points[0].vector, positions, velocities, np.swapaxes(errors, 1, 2))
 
     def _mix(self, points: list[_Point], noise: Array) -> _Point:
         """Return points of the same values as one, each window with the start state of the least cost."""
@@ -232,28 +238,16 @@ class WindowFitter:
         )
         return _Point(points[0].vector, positions, velocities, errors)
 
-    def _change_values(self, point: _Point, equations: _Equations, damping: float) -> Array:
-        """Return the step of Levenberg and Marquardt of the values, within their bounds."""
-        matrix, gradient = self._collect(point, equations)
-        matrix = matrix + damping * np.diag(np.diag(matrix))
-        return _solve_bounded(matrix, gradient, self._lowest - point.vector)
-
-    def _promise_decrease(self, point: _Point, equations: _Equations) -> float:
-        """Return how much the cost would decrease with the best values if the errors were linear."""
-        matrix, gradient = self._collect(point, equations)
-        change = self._change_values(point, equations, 0.0)
-        return -float(gradient @ change + change @ matrix @ change / 2)
-
     def _collect(self, point: _Point, equations: _Equations) -> tuple[Array, Array]:
         """Return the normal equations of the values: those of all windows, and what was known before."""
-        matrices, gradients, _ = self._reduce(equations, 0.0)
+        matrices, gradients = _eliminate_states(equations)
         known = 1.0 / np.square(self._doubt)
         return matrices.sum(axis=0) + np.diag(known), gradients.sum(axis=0) + known * (point.vector - self._center)
 
     def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
         noise = self._estimate_noise(point.errors)
         equations = self._form_equations(point, derivatives, noise)
-        matrices, gradients, _ = self._reduce(equations, 0.0)
+        matrices, gradients = _eliminate_states(equations)
         information = matrices.sum(axis=0)
         total = information + np.diag(1.0 / np.square(self._doubt))
         inverse = np.linalg.inv(total)
@@ -270,6 +264,22 @@ class WindowFitter:
         clipped = np.clip(point.errors, -LINEAR * spread, LINEAR * spread)
         remaining = np.sqrt(np.square(clipped).mean(axis=(0, 1)))
         return WindowFit(point.vector, information, freedom * inverse * np.outer(widen, widen), remaining)
+
+
+def _eliminate_states(equations: _Equations) -> tuple[Array, Array]:
+    """Return each window's matrix and gradient of the values alone.
+
+    Their shapes are (windows, unknowns, unknowns) and (windows, unknowns).
+    """
+    influence = equations.mixed @ _invert(equations.states, 0.0)
+    matrices: Array = equations.values - influence @ np.swapaxes(equations.mixed, 1, 2)
+    gradients: Array = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
+    return matrices, gradients
+
+
+def _invert(matrices: Array, damping: float) -> Array:
+    """Return the inverses of matrices of start states, damped relative to their diagonals."""
+    return np.asarray(np.linalg.inv(matrices * (1.0 + damping * np.eye(matrices.shape[-1]))), np.float64)
 
 
 def _tie(matrices: Array) -> Array:
