@@ -18,10 +18,10 @@ from rlctl_robot.identify.windows import WindowPlayer
 
 _MOST_ITERATIONS = 60
 ENOUGH = 0.1  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
-_REUSED = 10.0  # decrease of the cost, relative to the smallest to continue, above which derivatives may be old
+_REUSED = 10.0  # promised decrease, relative to the smallest to continue, above which derivatives may be old
 _UNSTABLE = 1e30  # cost of a simulation without finite positions
 _NEAR = 0.1  # decrease of the cost per reading, below which derivatives hold for the next step too
-_DAMPINGS = (0.01, 0.3, 10.0, 1000.0)  # factors of the last damping, tried in one batch
+_DAMPINGS = (0.01, 1.0, 100.0)  # factors of the last damping, tried in one batch
 _STATE_DAMPINGS = (1e-3, 1.0, 1e3)  # of start states, of which each window takes the best
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3
 _POSITION_STEP, _VELOCITY_STEP = 2e-4, 2e-3  # [rad or m], [rad/s or m/s], for derivatives
@@ -121,7 +121,7 @@ class WindowFitter:
                     break
                 damping = min(1000.0 * damping, _MOST_DAMPING)
                 continue
-            is_new = not _REUSED * enough < decrease < _NEAR * point.errors.size
+            is_new = promised < _REUSED * enough or decrease > _NEAR * point.errors.size
             if is_new:
                 derivatives = self._differentiate(point)
         return self._finish(point, derivatives)
