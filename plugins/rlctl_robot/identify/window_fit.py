@@ -14,6 +14,13 @@ from rlctl.library_output import hide_instability
 from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.readings import LINEAR, ReadingErrors, find_steps
 from rlctl_robot.identify.unknowns import UnknownValues
+from rlctl_robot.identify.window_equations import (
+    WindowEquations,
+    eliminate_states,
+    invert_damped,
+    solve_bounded,
+    tie_states,
+)
 from rlctl_robot.identify.windows import WindowPlayer
 
 _MOST_ITERATIONS = 60
@@ -25,7 +32,6 @@ _DAMPINGS = (0.01, 1.0, 100.0)  # factors of the last damping, tried in one batc
 _STATE_DAMPINGS = (1e-3, 1.0, 1e3)  # of start states, of which each window takes the best
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3
 _POSITION_STEP, _VELOCITY_STEP = 2e-4, 2e-3  # [rad or m], [rad/s or m/s], for derivatives
-_TIE = 1e-6  # weight with which a start state stays where it is, relative to what its window says
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,17 +60,6 @@ class _Derivatives:
 
     values: Array  # shape (windows, rows, joints, unknowns)
     states: Array  # shape (windows, rows, joints, positions and velocities)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Equations:
-    """Normal equations of each window: of the values, of its start state, and between them."""
-
-    values: Array  # (windows, unknowns, unknowns)
-    states: Array  # (windows, states, states)
-    mixed: Array  # (windows, unknowns, states)
-    values_gradient: Array  # (windows, unknowns)
-    states_gradient: Array  # (windows, states)
 
 
 class WindowFitter:
@@ -100,13 +95,7 @@ class WindowFitter:
             equations = self._form_equations(point, derivatives, noise)
             cost = self._compute_cost(point, noise)
             dampings = np.clip(damping * np.array(_DAMPINGS), _LEAST_DAMPING, _MOST_DAMPING)
-            matrix, gradient = self._collect(point, equations)
-            change = _solve_bounded(matrix, gradient, self._lowest - point.vector)
-            promised = -float(gradient @ change + change @ matrix @ change / 2)
-            steps = [
-                _solve_bounded(matrix + factor * np.diag(np.diag(matrix)), gradient, self._lowest - point.vector)
-                for factor in dampings
-            ]
+            promised, steps = self._compute_steps(point, equations, dampings)
             candidates = self._try_steps(point, equations, steps, noise)
             costs = np.array([self._compute_cost(candidate, noise) for candidate in candidates])
             best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
@@ -175,7 +164,7 @@ class WindowFitter:
         ]
         return _Derivatives(np.stack(values, axis=-1), np.stack(states, axis=-1))
 
-    def _form_equations(self, point: _Point, derivatives: _Derivatives, noise: Array) -> _Equations:
+    def _form_equations(self, point: _Point, derivatives: _Derivatives, noise: Array) -> WindowEquations:
         """Return the normal equations at a point, with derivatives that were computed near it."""
         slopes, curvatures = self._readings.derive(point.errors, noise)
         weights = np.sqrt(curvatures)
@@ -185,17 +174,32 @@ class WindowFitter:
             (part * weights[..., None]).reshape(windows, errors.shape[1], -1)
             for part in (derivatives.values, derivatives.states)
         )
-        return _Equations(
+        return WindowEquations(
             values=np.swapaxes(of_values, 1, 2) @ of_values,
-            states=_tie(np.swapaxes(of_states, 1, 2) @ of_states),
+            states=tie_states(np.swapaxes(of_states, 1, 2) @ of_states),
             mixed=np.swapaxes(of_values, 1, 2) @ of_states,
             values_gradient=np.einsum("wip,wi->wp", of_values, errors),
             states_gradient=np.einsum("wip,wi->wp", of_states, errors),
         )
 
-    def _try_steps(self, point: _Point, equations: _Equations, steps: list[Array], noise: Array) -> list[_Point]:
+    def _compute_steps(self, point: _Point, equations: WindowEquations, dampings: Array) -> tuple[float, list[Array]]:
+        """Return by how much the cost would decrease if the errors were linear, and a step of the values per damping.
+
+        The steps are those of Levenberg and Marquardt within the values' bounds.
+        """
+        matrices, gradients = eliminate_states(equations)
+        known = 1.0 / np.square(self._doubt)
+        matrix = matrices.sum(axis=0) + np.diag(known)
+        gradient = gradients.sum(axis=0) + known * (point.vector - self._center)
+        lowest = self._lowest - point.vector
+        newton, *steps = (
+            solve_bounded(matrix + damping * np.diag(np.diag(matrix)), gradient, lowest) for damping in (0.0, *dampings)
+        )
+        return -float(gradient @ newton + newton @ matrix @ newton / 2), steps
+
+    def _try_steps(self, point: _Point, equations: WindowEquations, steps: list[Array], noise: Array) -> list[_Point]:
         """Return a point for each step of the values, with the best start state of each window."""
-        inverses = [_invert(equations.states, damping) for damping in _STATE_DAMPINGS]
+        inverses = [invert_damped(equations.states, damping) for damping in _STATE_DAMPINGS]
         starts = []
         for change in steps:
             vector = np.maximum(point.vector + change, self._lowest)
@@ -228,26 +232,10 @@ class WindowFitter:
         errors = np.stack([np.swapaxes(point.errors, 1, 2) for point in points])[best, windows, joints]
         return _Point(points[0].vector, positions, velocities, np.swapaxes(errors, 1, 2))
 
-    def _mix(self, points: list[_Point], noise: Array) -> _Point:
-        """Return points of the same values as one, each window with the start state of the least cost."""
-        costs = np.array([self._readings.cost(point.errors, noise).sum(axis=(1, 2)) for point in points])
-        best, windows = np.where(np.isfinite(costs), costs, np.inf).argmin(axis=0), np.arange(len(self._starts))
-        positions, velocities, errors = (
-            np.stack([getattr(point, name) for point in points])[best, windows]
-            for name in ("positions", "velocities", "errors")
-        )
-        return _Point(points[0].vector, positions, velocities, errors)
-
-    def _collect(self, point: _Point, equations: _Equations) -> tuple[Array, Array]:
-        """Return the normal equations of the values: those of all windows, and what was known before."""
-        matrices, gradients = _eliminate_states(equations)
-        known = 1.0 / np.square(self._doubt)
-        return matrices.sum(axis=0) + np.diag(known), gradients.sum(axis=0) + known * (point.vector - self._center)
-
     def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
         noise = self._estimate_noise(point.errors)
         equations = self._form_equations(point, derivatives, noise)
-        matrices, gradients = _eliminate_states(equations)
+        matrices, gradients = eliminate_states(equations)
         information = matrices.sum(axis=0)
         total = information + np.diag(1.0 / np.square(self._doubt))
         inverse = np.linalg.inv(total)
@@ -264,39 +252,3 @@ class WindowFitter:
         clipped = np.clip(point.errors, -LINEAR * spread, LINEAR * spread)
         remaining = np.sqrt(np.square(clipped).mean(axis=(0, 1)))
         return WindowFit(point.vector, information, freedom * inverse * np.outer(widen, widen), remaining)
-
-
-def _eliminate_states(equations: _Equations) -> tuple[Array, Array]:
-    """Return each window's matrix and gradient of the values alone.
-
-    Their shapes are (windows, unknowns, unknowns) and (windows, unknowns).
-    """
-    influence = equations.mixed @ _invert(equations.states, 0.0)
-    matrices: Array = equations.values - influence @ np.swapaxes(equations.mixed, 1, 2)
-    gradients: Array = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
-    return matrices, gradients
-
-
-def _invert(matrices: Array, damping: float) -> Array:
-    """Return the inverses of matrices of start states, damped relative to their diagonals."""
-    return np.asarray(np.linalg.inv(matrices * (1.0 + damping * np.eye(matrices.shape[-1]))), np.float64)
-
-
-def _tie(matrices: Array) -> Array:
-    size = matrices.shape[-1]
-    sizes = np.trace(matrices, axis1=1, axis2=2)[:, None, None] / size
-    tied: Array = matrices + _TIE * np.maximum(sizes, 1e-12) * np.eye(size)
-    return tied
-
-
-def _solve_bounded(matrix: Array, gradient: Array, lowest: Array) -> Array:
-    """Return the step that minimises a quadratic; components that would fall below `lowest` end there."""
-    change = np.linalg.solve(matrix, -gradient)
-    held = change < lowest
-    if not held.any() or held.all():
-        return np.maximum(change, lowest)
-    free = ~held
-    change[held] = lowest[held]
-    pull = gradient[free] + matrix[np.ix_(free, held)] @ change[held]
-    change[free] = np.linalg.solve(matrix[np.ix_(free, free)], -pull)
-    return np.maximum(change, lowest)
