@@ -94,21 +94,3 @@ def print_mujoco_warnings() -> None:
     mujoco: Any = sys.modules.get("mujoco")
     if mujoco is not None and mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(lambda text: print_line(f"MuJoCo warning: {text}"))
-
-
-@contextlib.contextmanager
-def hide_instability() -> Iterator[None]:
-    """Leave out MuJoCo's warnings of unstable simulations, which are expected among the candidates of a search."""
-    print_mujoco_warnings()
-    mujoco: Any = sys.modules["mujoco"]
-    show = mujoco.get_mju_user_warning()
-
-    def filter_warning(text: str) -> None:
-        if "The simulation is unstable" not in text:
-            show(text)
-
-    mujoco.set_mju_user_warning(filter_warning)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(show)

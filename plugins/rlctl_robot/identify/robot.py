@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, UsageError, check_name
-from rlctl.library_output import hide_instability
+from rlctl.task.mujoco.world import hide_instability
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression, differentiate
 from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise

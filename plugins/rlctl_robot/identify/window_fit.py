@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rlctl.library_output import hide_instability
+from rlctl.task.mujoco.world import hide_instability
 from rlctl_robot.identify.log import Array
 from rlctl_robot.identify.readings import LINEAR, ReadingErrors, find_steps
 from rlctl_robot.identify.unknowns import UnknownValues

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
-from rlctl.library_output import hide_instability
 from rlctl.storage import yaml_text
+from rlctl.task.mujoco.world import hide_instability
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression
 from rlctl_robot.identify.motion import check_positions, read_motion, write_motion
