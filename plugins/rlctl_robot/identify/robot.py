@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.errors import AnswerIsNo, UsageError, check_name
+from rlctl.task.mujoco.world import hide_instability
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression, differentiate
 from rlctl_robot.identify.intervals import CONFIDENCE, WIDEST, explain_unknown, measure_noise
@@ -144,6 +145,9 @@ def identify_robot(
     before = _hold_still(_take_nominal(robot, after), motion, moving)
     report("held-out rows")
     errors = play_through(player, motion, [before, after])[:, is_held_out]
+    notes = [*motion.notes, *robot.notes]
+    if player.is_unstable[0]:
+        notes.append(f"{path.name}: the simulation is unstable with the file's values, so its error says little")
     by_joint = np.sqrt(np.square(errors).mean(axis=1))
     bad = _find_unexplained(motion, by_joint, is_held_out, moving, after)
     if len(bad) == len(moving):
@@ -157,10 +161,10 @@ def identify_robot(
     values += _list_still(robot, chosen, moving)
     total = np.sqrt(np.square(by_joint[:, moving]).mean(axis=1))
     if not any(value.known for value in values):
-        notes = list(dict.fromkeys(value.note for value in values))
-        more = f", and {len(notes) - _MOST_NOTES} more notes" if len(notes) > _MOST_NOTES else ""
+        reasons = list(dict.fromkeys(value.note for value in values))
+        more = f", and {len(reasons) - _MOST_NOTES} more notes" if len(reasons) > _MOST_NOTES else ""
         raise AnswerIsNo(
-            f"{log}: this log determines none of the values: {'; '.join(notes[:_MOST_NOTES])}{more}\n"
+            f"{log}: this log determines none of the values: {'; '.join(reasons[:_MOST_NOTES])}{more}\n"
             f"error held out: {total[0]:.3g} rad with the file's values, {total[1]:.3g} rad with the best"
         )
     return RobotIdentification(
@@ -174,7 +178,7 @@ def identify_robot(
         error_before=float(total[0]),
         error_after=float(total[1]),
         joint_errors={robot.joints[joint]: (float(by_joint[0, joint]), float(by_joint[1, joint])) for joint in moving},
-        notes=[*motion.notes, *robot.notes],
+        notes=notes,
         fitted=after,
         joints=robot.joints,
         is_held_out=is_held_out,
@@ -296,11 +300,14 @@ def play_through(player: WindowPlayer, motion: ServoLog, candidates: list[Values
         name: np.concatenate([stack_values(candidate, 1)[name] for candidate in candidates]) for name in candidates[0]
     }
     count = len(candidates)
-    parts = []
+    parts, unstable = [], []
     for begin, length in zip(motion.starts, motion.lengths, strict=True):
         first, speed = (np.repeat(rows[begin][None], count, axis=0) for rows in (motion.positions, velocities))
-        played = player.play(values, np.full(count, begin), first, speed, length - 1)
+        with hide_instability():
+            played = player.play(values, np.full(count, begin), first, speed, length - 1)
         parts.append(played - motion.positions[begin : begin + length])
+        unstable.append(player.is_unstable)
+    player.is_unstable = np.any(unstable, axis=0)  # in any part
     return np.concatenate(parts, axis=1)
 
 

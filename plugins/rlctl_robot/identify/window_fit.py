@@ -10,20 +10,28 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rlctl.task.mujoco.world import hide_instability
 from rlctl_robot.identify.log import Array
+from rlctl_robot.identify.readings import LINEAR, ReadingErrors, find_steps
 from rlctl_robot.identify.unknowns import UnknownValues
+from rlctl_robot.identify.window_equations import (
+    WindowEquations,
+    eliminate_states,
+    invert_damped,
+    solve_bounded,
+    tie_states,
+)
 from rlctl_robot.identify.windows import WindowPlayer
 
 _MOST_ITERATIONS = 60
-ENOUGH = 0.5  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
-_NEAR = 0.2  # relative decrease of the cost, below which derivatives hold for the next step too
-_DAMPINGS = (0.01, 0.1, 1.0, 10.0, 1000.0)  # factors of the last damping, tried in one batch
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-9, 1e6
-_LINEAR = 3.0  # standard deviations, beyond which an error counts linearly (Huber)
-_QUANTILE, _AT_QUANTILE = 0.9, 1.645  # of errors, and of a normal distribution
+ENOUGH = 0.1  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
+_REUSED = 10.0  # promised decrease, relative to the smallest to continue, above which derivatives may be old
+_UNSTABLE = 1e30  # cost of a simulation without finite positions
+_NEAR = 0.1  # decrease of the cost per reading, below which derivatives hold for the next step too
+_DAMPINGS = (0.01, 1.0, 100.0)  # factors of the last damping, tried in one batch
+_STATE_DAMPINGS = (1e-3, 1.0, 1e3)  # of start states, of which each window takes the best
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3
 _POSITION_STEP, _VELOCITY_STEP = 2e-4, 2e-3  # [rad or m], [rad/s or m/s], for derivatives
-_FINEST = 1e-5  # [rad or m], of a measurement
-_TIE = 1e-6  # weight with which a start state stays where it is, relative to what its window says
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,17 +62,6 @@ class _Derivatives:
     states: Array  # shape (windows, rows, joints, positions and velocities)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Equations:
-    """Normal equations of each window: of the values, of its start state, and between them."""
-
-    values: Array  # (windows, unknowns, unknowns)
-    states: Array  # (windows, states, states)
-    mixed: Array  # (windows, unknowns, states)
-    values_gradient: Array  # (windows, unknowns)
-    states_gradient: Array  # (windows, states)
-
-
 class WindowFitter:
     """Fits values to the windows of a log that begin at the rows `starts` and have `steps` control steps."""
 
@@ -80,6 +77,7 @@ class WindowFitter:
         """`positions` [rad or m] are the encoders', `velocities` a first guess; shape (rows, joints)."""
         self._player, self._unknowns, self._starts, self._steps = player, unknowns, starts, steps
         self._measured = np.stack([positions[start : start + steps + 1] for start in starts])
+        self._readings = ReadingErrors(find_steps(positions))
         self._first = (positions[starts], velocities[starts])
         self._lowest = unknowns.column("lowest")
         self._center, self._doubt = unknowns.column("first"), unknowns.column("doubt")
@@ -88,7 +86,7 @@ class WindowFitter:
         self._same_tree = trees[:, None] == trees
 
     def fit(self, vector: Array, report: Callable[[str], None], enough: float = ENOUGH) -> WindowFit:
-        """Return the best values near a first guess, shape (unknowns,); `enough` is the last step's decrease."""
+        """Return the best values near a first guess, shape (unknowns,); `enough` is the least decrease to go on for."""
         point = self._play([(np.maximum(vector, self._lowest), *self._first)])[0]
         damping, is_new = _FIRST_DAMPING, True
         derivatives = self._differentiate(point)
@@ -97,19 +95,22 @@ class WindowFitter:
             equations = self._form_equations(point, derivatives, noise)
             cost = self._compute_cost(point, noise)
             dampings = np.clip(damping * np.array(_DAMPINGS), _LEAST_DAMPING, _MOST_DAMPING)
-            candidates = self._play([self._step(point, equations, factor) for factor in dampings])
+            promised, steps = self._compute_steps(point, equations, dampings)
+            candidates = self._try_steps(point, equations, steps, noise)
             costs = np.array([self._compute_cost(candidate, noise) for candidate in candidates])
             best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
             decrease = cost - float(costs[best])
             if decrease > 0:
                 point, damping = candidates[best], float(dampings[best])
             report(f"step {iteration + 1}: remaining error {np.sqrt(np.square(point.errors).mean()):.3g}")
+            if is_new and promised < enough:
+                break
             if is_new and decrease < enough:
-                if decrease > 0 or damping >= _MOST_DAMPING:
+                if damping >= _MOST_DAMPING:
                     break
                 damping = min(1000.0 * damping, _MOST_DAMPING)
                 continue
-            is_new = decrease > _NEAR * cost or decrease < enough
+            is_new = promised < _REUSED * enough or decrease > _NEAR * point.errors.size
             if is_new:
                 derivatives = self._differentiate(point)
         return self._finish(point, derivatives)
@@ -118,29 +119,23 @@ class WindowFitter:
         """Simulate all windows for several values and start states in one batch."""
         windows = len(self._starts)
         vectors = np.repeat(np.array([vector for vector, _, _ in starts]), windows, axis=0)
-        played = self._player.play(
-            self._unknowns.values(vectors),
-            np.tile(self._starts, len(starts)),
-            np.concatenate([positions for _, positions, _ in starts]),
-            np.concatenate([velocities for _, _, velocities in starts]),
-            self._steps,
-        )
+        with hide_instability():
+            played = self._player.play(
+                self._unknowns.values(vectors),
+                np.tile(self._starts, len(starts)),
+                np.concatenate([positions for _, positions, _ in starts]),
+                np.concatenate([velocities for _, _, velocities in starts]),
+                self._steps,
+            )
         errors = played.reshape(len(starts), *self._measured.shape) - self._measured
         return [_Point(*start, error) for start, error in zip(starts, errors, strict=True)]
 
     def _estimate_noise(self, errors: Array) -> Array:
-        """Return the standard deviation of each joint's errors, on which outliers have little influence."""
-        # Not the median: a joint that rests for most of the time must not make its motion an outlier.
-        middle = np.maximum(np.quantile(np.abs(errors), _QUANTILE, axis=(0, 1)) / _AT_QUANTILE, _FINEST)
-        clipped = np.clip(errors, -_LINEAR * middle, _LINEAR * middle)
-        noise: Array = np.maximum(np.sqrt(np.square(clipped).mean(axis=(0, 1))), _FINEST)
-        return noise
+        return self._readings.estimate_noise(errors.reshape(-1, errors.shape[-1]))
 
     def _compute_cost(self, point: _Point, noise: Array) -> float:
-        sizes = np.abs(point.errors / noise)
-        costs = np.where(sizes < _LINEAR, np.square(sizes) / 2, _LINEAR * sizes - _LINEAR**2 / 2)
         known = np.square((point.vector - self._center) / self._doubt).sum() / 2
-        return float(costs.sum() + known)
+        return float(self._readings.cost(point.errors, noise).sum() + known)
 
     def _differentiate(self, point: _Point) -> _Derivatives:
         """Compute all derivatives in one batch of worlds."""
@@ -169,57 +164,78 @@ class WindowFitter:
         ]
         return _Derivatives(np.stack(values, axis=-1), np.stack(states, axis=-1))
 
-    def _form_equations(self, point: _Point, derivatives: _Derivatives, noise: Array) -> _Equations:
+    def _form_equations(self, point: _Point, derivatives: _Derivatives, noise: Array) -> WindowEquations:
         """Return the normal equations at a point, with derivatives that were computed near it."""
-        sizes = np.abs(point.errors / noise)
-        weights = np.sqrt(np.where(sizes < _LINEAR, 1.0, _LINEAR / np.maximum(sizes, 1e-9))) / noise
+        slopes, curvatures = self._readings.derive(point.errors, noise)
+        weights = np.sqrt(curvatures)
         windows = len(self._starts)
-        errors = (point.errors * weights).reshape(windows, -1)
+        errors = (slopes / weights).reshape(windows, -1)
         of_values, of_states = (
             (part * weights[..., None]).reshape(windows, errors.shape[1], -1)
             for part in (derivatives.values, derivatives.states)
         )
-        return _Equations(
+        return WindowEquations(
             values=np.swapaxes(of_values, 1, 2) @ of_values,
-            states=_tie(np.swapaxes(of_states, 1, 2) @ of_states),
+            states=tie_states(np.swapaxes(of_states, 1, 2) @ of_states),
             mixed=np.swapaxes(of_values, 1, 2) @ of_states,
             values_gradient=np.einsum("wip,wi->wp", of_values, errors),
             states_gradient=np.einsum("wip,wi->wp", of_states, errors),
         )
 
-    def _reduce(self, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
-        """Eliminate the start states: return each window's matrix and gradient of the values alone.
+    def _compute_steps(self, point: _Point, equations: WindowEquations, dampings: Array) -> tuple[float, list[Array]]:
+        """Return by how much the cost would decrease if the errors were linear, and a step of the values per damping.
 
-        Their shapes are (windows, unknowns, unknowns) and (windows, unknowns).
+        The steps are those of Levenberg and Marquardt within the values' bounds.
         """
-        size = equations.states.shape[-1]
-        inverse = np.asarray(np.linalg.inv(equations.states * (1.0 + damping * np.eye(size))), np.float64)
-        influence = equations.mixed @ inverse
-        matrices = equations.values - influence @ np.swapaxes(equations.mixed, 1, 2)
-        gradients = equations.values_gradient - np.einsum("wps,ws->wp", influence, equations.states_gradient)
-        return matrices, gradients, inverse
-
-    def _step(self, point: _Point, equations: _Equations, damping: float) -> tuple[Array, Array, Array]:
-        """Return the values and start states after a step of Levenberg and Marquardt within the values' bounds."""
-        matrices, gradients, inverse = self._reduce(equations, damping)
+        matrices, gradients = eliminate_states(equations)
         known = 1.0 / np.square(self._doubt)
         matrix = matrices.sum(axis=0) + np.diag(known)
         gradient = gradients.sum(axis=0) + known * (point.vector - self._center)
-        matrix = matrix + damping * np.diag(np.diag(equations.values.sum(axis=0)) + known)
-        change = _solve_bounded(matrix, gradient, self._lowest - point.vector)
-        pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
-        moved = -np.einsum("wst,wt->ws", inverse, pull)
-        joints = len(self._places)
-        return (
-            np.maximum(point.vector + change, self._lowest),
-            point.positions + moved[:, :joints],
-            point.velocities + moved[:, joints:],
+        lowest = self._lowest - point.vector
+        newton, *steps = (
+            solve_bounded(matrix + damping * np.diag(np.diag(matrix)), gradient, lowest) for damping in (0.0, *dampings)
         )
+        return -float(gradient @ newton + newton @ matrix @ newton / 2), steps
+
+    def _try_steps(self, point: _Point, equations: WindowEquations, steps: list[Array], noise: Array) -> list[_Point]:
+        """Return a point for each step of the values, with the best start state of each window."""
+        inverses = [invert_damped(equations.states, damping) for damping in _STATE_DAMPINGS]
+        starts = []
+        for change in steps:
+            vector = np.maximum(point.vector + change, self._lowest)
+            pull = equations.states_gradient + np.einsum("wps,p->ws", equations.mixed, change)
+            moves = [-np.einsum("wst,wt->ws", inverse, pull) for inverse in inverses]
+            starts += [(vector, *states) for states in self._propose_states(point, moves, noise)]
+        points = self._play(starts)
+        count = len(points) // len(steps)
+        return [self._mix(points[begin : begin + count], noise) for begin in range(0, len(points), count)]
+
+    def _propose_states(self, point: _Point, moves: list[Array], noise: Array) -> list[tuple[Array, Array]]:
+        """Return start states to compare: after each of the moves, shape (windows, states), and with a joint reset."""
+        joints = len(self._places)
+        proposed = [(point.positions + move[:, :joints], point.velocities + move[:, joints:]) for move in moves]
+        # A joint that rests has another minimum where it begins with a speed and stops: no small step leads out of it.
+        costs = self._readings.cost(point.errors, noise).sum(axis=1)
+        is_worst = costs >= np.where(self._same_tree, costs[:, None], -np.inf).max(axis=-1)
+        first = [np.where(is_worst, *pair) for pair in zip(self._first, proposed[0], strict=True)]
+        return [*proposed, (first[0], first[1]), (first[0], np.where(is_worst, 0.0, first[1]))]
+
+    def _mix(self, points: list[_Point], noise: Array) -> _Point:
+        """Return points of the same values as one, each window and tree with the start state of the least cost."""
+        costs = np.array([self._readings.cost(point.errors, noise).sum(axis=1) for point in points])
+        costs = np.where(np.isfinite(costs), costs, _UNSTABLE) @ self._same_tree  # of each joint's tree
+        best, windows, joints = costs.argmin(axis=0), np.arange(len(self._starts))[:, None], np.arange(costs.shape[-1])
+        positions, velocities = (
+            np.stack([getattr(point, name) for point in points])[best, windows, joints]
+            for name in ("positions", "velocities")
+        )
+        errors = np.stack([np.swapaxes(point.errors, 1, 2) for point in points])[best, windows, joints]
+        return _Point(points[0].vector, positions, velocities, np.swapaxes(errors, 1, 2))
 
     def _finish(self, point: _Point, derivatives: _Derivatives) -> WindowFit:
         noise = self._estimate_noise(point.errors)
         equations = self._form_equations(point, derivatives, noise)
-        matrices, gradients, _ = self._reduce(equations, 0.0)
+        matrices, gradients = eliminate_states(equations)
         information = matrices.sum(axis=0)
         total = information + np.diag(1.0 / np.square(self._doubt))
         inverse = np.linalg.inv(total)
@@ -229,24 +245,10 @@ class WindowFitter:
         moved = moved - moved.mean(axis=0)
         measured = (1.0 - 1.0 / len(moved)) * np.square(moved).sum(axis=0)
         widen = np.sqrt(np.maximum(1.0, measured / np.diag(inverse)))
-        return WindowFit(point.vector, information, inverse * np.outer(widen, widen), noise)
-
-
-def _tie(matrices: Array) -> Array:
-    size = matrices.shape[-1]
-    sizes = np.trace(matrices, axis1=1, axis2=2)[:, None, None] / size
-    tied: Array = matrices + _TIE * np.maximum(sizes, 1e-12) * np.eye(size)
-    return tied
-
-
-def _solve_bounded(matrix: Array, gradient: Array, lowest: Array) -> Array:
-    """Return the step that minimises a quadratic; components that would fall below `lowest` end there."""
-    change = np.linalg.solve(matrix, -gradient)
-    held = change < lowest
-    if not held.any() or held.all():
-        return np.maximum(change, lowest)
-    free = ~held
-    change[held] = lowest[held]
-    pull = gradient[free] + matrix[np.ix_(free, held)] @ change[held]
-    change[free] = np.linalg.solve(matrix[np.ix_(free, free)], -pull)
-    return np.maximum(change, lowest)
+        # The noise is that of the best values and start states, and smaller than that of the true ones.
+        fitted = len(point.vector) + point.positions.size + point.velocities.size
+        freedom = point.errors.size / max(point.errors.size - fitted, 1)
+        spread = self._readings.spread(noise)
+        clipped = np.clip(point.errors, -LINEAR * spread, LINEAR * spread)
+        remaining = np.sqrt(np.square(clipped).mean(axis=(0, 1)))
+        return WindowFit(point.vector, information, freedom * inverse * np.outer(widen, widen), remaining)

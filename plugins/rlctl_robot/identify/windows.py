@@ -32,6 +32,8 @@ class WindowPlayer:
         self._commands, self._threads = commands, threads
         self.sides = np.zeros_like(commands)
         """Side of its play, -1 to 1, on which each link lies in each row: where a window begins."""
+        self.is_unstable = np.zeros(0, bool)
+        """Whether each of the worlds played last was unstable, so that MuJoCo put it back to its first position."""
         self.substeps = max(1, int(np.ceil(control_dt / robot.model.opt.timestep - 1e-6)))
         self._batches: dict[int, Any] = {}
 
@@ -42,10 +44,12 @@ class WindowPlayer:
         encoders read them) and `velocities`, shape (worlds, joints), the state in that row.
         """
         parts = []
+        self.is_unstable = np.zeros(len(first), bool)
         for begin in range(0, len(first), _MOST_WORLDS):
             rows = slice(begin, begin + _MOST_WORLDS)
             some = {name: value[rows] for name, value in values.items()}
             parts.append(self._play_batch(some, first[rows], positions[rows], velocities[rows], steps))
+            self.is_unstable[rows] = self._batches[len(first[rows])].warning[..., 1].any(axis=1)
         return np.concatenate(parts)
 
     def _play_batch(self, values: Values, first: Array, positions: Array, velocities: Array, steps: int) -> Array:
@@ -55,6 +59,7 @@ class WindowPlayer:
         batch.bind("qvel")[:, places] = velocities
         if len(plays):
             batch.bind("qpos")[:, plays] = values[BACKLASH] / 2 * self.sides[first]
+        batch.warning[:] = 0  # the last value and the number of each
         played = np.empty((len(first), steps + 1, positions.shape[1]))
         played[:, 0] = positions
         for step in range(steps):

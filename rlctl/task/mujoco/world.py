@@ -49,6 +49,23 @@ def import_mujoco() -> Any:
     return mujoco
 
 
+@contextlib.contextmanager
+def hide_instability() -> Iterator[None]:
+    """Leave out MuJoCo's warnings of unstable simulations, which are expected among the candidates of a search."""
+    mujoco = import_mujoco()
+    show = mujoco.get_mju_user_warning()
+
+    def filter_warning(text: str) -> None:
+        if "The simulation is unstable" not in text:
+            show(text)
+
+    mujoco.set_mju_user_warning(filter_warning)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(show)
+
+
 def _too_old(what: str, needed: str) -> UsageError:
     installed = importlib.metadata.version("mujoco")
     return UsageError(f"{what} needs MuJoCo {needed} or later, and {installed} is installed: pip install -U mujoco")

@@ -10,6 +10,7 @@ import pytest
 
 from rlctl.errors import AnswerIsNo, ArtifactError, UsageError
 from rlctl.storage import yaml_text
+from rlctl.task.mujoco.world import hide_instability
 from rlctl_robot.identify.column_checks import check_commands, check_model
 from rlctl_robot.identify.first_guess import Regression
 from rlctl_robot.identify.motion import check_positions, read_motion, write_motion
@@ -28,6 +29,7 @@ from rlctl_robot.identify.robot_model import (
 )
 from rlctl_robot.identify.robot_report import make_mjcf, make_motors, make_ranges, show_robot, write_robot
 from rlctl_robot.identify.unknowns import list_unknowns
+from rlctl_robot.identify.window_fit import WindowFitter
 from rlctl_robot.identify.windows import WindowPlayer
 
 ROBOT = Path(__file__).with_name("two_servos.xml")
@@ -160,6 +162,47 @@ def test_a_delay_between_physics_steps_moves_the_commands(recorded):
     # 7 ms late: in the substep from 5 to 10 ms after row 10, row 9 for 2 ms and row 10 for 3 ms.
     commands = player._find_commands(np.array([10]), np.array([0.007]))[0, :, 0]
     assert commands == pytest.approx([9.0, 0.4 * 9 + 0.6 * 10, 10.0, 10.0])
+
+
+def test_unstable_worlds_are_marked_and_hidden_warnings_are_not_printed(recorded):
+    robot, targets, _ = recorded
+    values = stack_values(robot.nominal, 2)
+    values[STIFFNESS] = np.array([[60.0, 35.0], [1e9, 1e9]])
+    player = WindowPlayer(robot, targets, DT, 1)
+    printed, before = [], mujoco.get_mju_user_warning()
+
+    def play_both():
+        player.play(values, np.zeros(2, int), np.repeat(targets[:1], 2, axis=0), np.zeros((2, 2)), 50)
+
+    mujoco.set_mju_user_warning(printed.append)
+    try:
+        with hide_instability():
+            play_both()
+        assert player.is_unstable.tolist() == [False, True]
+        assert printed == []
+        play_both()
+        assert "The simulation is unstable" in printed[0]
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+@pytest.mark.slow
+def test_a_resting_joint_that_begins_with_a_wrong_speed_does_not_keep_the_search(recorded):
+    robot, targets, _ = recorded
+    targets = targets * [1, 0]
+    positions = play(robot, targets, HIDDEN)
+    hidden = robot.nominal | {name: np.array(value) for name, value in HIDDEN.items()}
+    unknowns = list_unknowns(robot, hidden, ["coulomb"], range(2))
+    player, starts = WindowPlayer(robot, targets, DT, 1), np.arange(0, 500, 50)
+    speeds = np.gradient(positions, DT, axis=0)
+    wrong = speeds.copy()
+    wrong[starts[3:6], 1] += 10.0  # [rad/s]
+    best, found = (
+        WindowFitter(player, unknowns, positions, first, starts, 50).fit(unknowns.column("first"), lambda _: None)
+        for first in (speeds, wrong)
+    )
+    assert found.vector == pytest.approx(best.vector, rel=0.01)
+    assert found.noise == pytest.approx(best.noise, rel=0.02)
 
 
 @pytest.mark.slow
