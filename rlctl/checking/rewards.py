@@ -16,6 +16,9 @@ RAW_TERMS = "metrics/"
 """The same without their weights, of tasks."""
 SUM_TOLERANCE = 1e-3  # part of the reward or of 1: terms may be rounded for the log
 FEW_WRONG = 0.02  # part of the steps: the last of an episode may have a bonus
+ROUNDS = 5  # of a fit without the steps that have a bonus of their own
+ORDINARY = 0.95  # part of the steps that have none
+LEAST_WEIGHT = 1e-6  # what is 0 but for rounding
 ENOUGH_STEPS = 50  # With fewer steps no rule judges what never happens
 
 
@@ -100,6 +103,32 @@ def find_wrong_sums(episodes: Sequence[CheckedEpisode]) -> NDArray[np.float64]:
     off = np.nan_to_num(off)  # a step without terms
     is_wrong: NDArray[np.bool_] = off > SUM_TOLERANCE
     return np.where(is_wrong & (is_wrong.mean() > FEW_WRONG), off, 0.0)
+
+
+def find_weights(episodes: Sequence[CheckedEpisode]) -> dict[str, float]:
+    """Return constant weights with which all terms, and a constant, are the reward, also those of a part of the steps
+    that have a bonus of their own; empty where there are none. A term that is always 0 has none."""
+    terms = join_terms(episodes)
+    rewards = np.concatenate([episode.rewards for episode in episodes])
+    columns = [values for values in terms.values() if len(values) == len(rewards)]
+    if not columns or len(columns) < len(terms):
+        return {}
+    table = np.column_stack([*columns, np.ones(len(rewards))])
+    known = np.isfinite(table).all(axis=1) & np.isfinite(rewards)
+    table, rewards = table[known], rewards[known]
+    allowed = SUM_TOLERANCE * np.maximum(1.0, np.abs(rewards))
+    chosen = np.arange(len(rewards))
+    weights = np.zeros(table.shape[1])
+    for _ in range(ROUNDS):
+        weights = np.linalg.lstsq(table[chosen], rewards[chosen], rcond=None)[0]
+        off = np.abs(table @ weights - rewards)
+        if np.mean(off <= allowed) >= ORDINARY:
+            found = zip([*terms, "constant"], weights.tolist(), strict=True)
+            used = {name: weight for name, weight in found if abs(weight) > LEAST_WEIGHT}
+            is_zero = {name for name, values in terms.items() if not values.any()}
+            return used if used.keys() | is_zero >= terms.keys() else {}
+        chosen = np.argsort(off)[: int(ORDINARY * len(rewards))]
+    return {}
 
 
 def reports_success(episodes: Sequence[CheckedEpisode]) -> bool:

@@ -127,6 +127,7 @@ class GoalTrials:
 
     instance: Instance
     drawn: DrawnGoal
+    others: Sequence[DrawnPlace] = ()  # what else each reset draws, and no step changes
     turned_places: dict[tuple[int, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
     """Where the robot is by a turned source, by its element, seed, kind of actions and steps: goals move no robot."""
 
@@ -330,7 +331,7 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
         raise NotJudged("reset takes no seed (RL202)")
     places, by_chance = _find_drawn(instance)
     for place in places:
-        copies, turned = _find_copies(instance, place), _find_turned(instance, place)
+        copies, turned = find_copies(instance, place), _find_turned(instance, place)
         if copies or turned:
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
@@ -340,7 +341,7 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
                 goals[seed] = place.read(instance.env).tolist()
             drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies))
             yield Fact("goals", drawn)
-            yield from judges_goals.judge(GoalTrials(instance, drawn))
+            yield from judges_goals.judge(GoalTrials(instance, drawn, [one for one in places if one != place]))
             return
     yield from _find_scaled(instance, places)
     if by_chance:
@@ -352,7 +353,7 @@ def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[F
     """Yield the first attribute that the observation shows in a smaller unit."""
     for place in places:
         for factor in SMALLER_UNITS:
-            if copies := _find_copies(instance, place, factor):
+            if copies := find_copies(instance, place, factor):
                 seen = _observe(instance, place, 0.0)[copies[0][0] :][: place.size]
                 yield Fact(SCALED_GOAL, ScaledGoal(place.name, copies[0][0], factor, float(np.linalg.norm(seen))))
                 return
@@ -400,7 +401,7 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
     return found
 
 
-def _find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
+def find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
     """Return where the observation has the place, or its difference to something, times a factor; and the sign."""
     before, plain, shifted = (_observe(instance, place, shift) for shift in (0.0, 0.0, 1.0))
     if before.shape != plain.shape or plain.shape != shifted.shape:
