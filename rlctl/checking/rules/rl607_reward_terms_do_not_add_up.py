@@ -6,7 +6,7 @@ import numpy as np
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.records import Records
-from rlctl.checking.rewards import WITH_SEARCH, find_weights, find_wrong_sums, require_terms, sum_terms
+from rlctl.checking.rewards import WITH_SEARCH, find_weights, find_wrong_sums, require_logged_terms, sum_terms
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -24,7 +24,7 @@ RULE = Rule(
 
 @judges_records(RULE, *WITH_SEARCH)
 def _find_wrong_sum(records: Records) -> Iterator[RuleFinding]:
-    episodes = require_terms(records)
+    episodes = require_logged_terms(records)
     off = find_wrong_sums(episodes)
     if off.any():
         worst = int(off.argmax())

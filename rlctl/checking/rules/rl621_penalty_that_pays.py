@@ -11,7 +11,6 @@ from rlctl.checking.rewards import (
     RAW_TERMS,
     WITH_SEARCH,
     find_terms,
-    find_weights,
     find_wrong_sums,
     join_terms,
     require_enough,
@@ -41,16 +40,10 @@ MOVING_PAYS = 2.0  # times as much as doing nothing
 @judges_records(RULE, *WITH_SEARCH)
 def _find_paying_penalties(records: Records) -> Iterator[RuleFinding]:
     episodes = require_enough(require_terms(records))
-    weights: dict[str, float] = {}
     if find_wrong_sums(episodes).any():
-        weights = find_weights(episodes)
-        if not weights:
-            raise NotJudged("reward_terms do not add up to the reward (RL607)")
-    logged = join_terms(episodes)
-    raw_terms = join_terms(episodes, RAW_TERMS) or (logged if weights else {})
-    for name, term in logged.items():
-        weight = weights.get(name, 1.0)
-        values = weight * term
+        raise NotJudged("reward_terms do not add up to the reward (RL607)")
+    raw_terms = join_terms(episodes, RAW_TERMS)
+    for name, values in join_terms(episodes).items():
         always_pays = bool((values >= 0).all() and (values != values[0]).any())
         if not always_pays:
             continue
@@ -60,7 +53,7 @@ def _find_paying_penalties(records: Records) -> Iterator[RuleFinding]:
         raw = raw_terms.get(name)
         if raw is not None and raw.min() < 0 and is_error(name):  # their product is positive
             message, severity = f"{message}: its weight and the term itself are both negative", Severity.WARNING
-        elif is_about_actions(name) and _pays_for_moving(episodes, name, weight):
+        elif is_about_actions(name) and _pays_for_moving(episodes, name):
             message, severity = f"{message}: moving earns more of it than doing nothing", Severity.WARNING
         elif is_cost(name):
             severity = Severity.INFO
@@ -70,11 +63,11 @@ def _find_paying_penalties(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding(RULE, message, evidence, severity)
 
 
-def _pays_for_moving(episodes: Sequence[CheckedEpisode], name: str, weight: float) -> bool:
+def _pays_for_moving(episodes: Sequence[CheckedEpisode], name: str) -> bool:
     """Say whether a term is clearly larger with random and extreme actions than with none."""
     idle = _read_term([episode for episode in episodes if not episode.taken.any()], name)
     moving = _read_term([episode for episode in episodes if episode.actions in ("random", "extreme")], name)
-    return bool(idle.size and moving.size and weight * moving.mean() > MOVING_PAYS * weight * idle.mean())
+    return bool(idle.size and moving.size and moving.mean() > MOVING_PAYS * idle.mean())
 
 
 def _read_term(episodes: Sequence[CheckedEpisode], name: str) -> NDArray[np.float64]:
