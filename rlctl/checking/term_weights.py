@@ -150,7 +150,9 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
     entries: dict[str, list[tuple[list[Factor], Place]]] = {}
     for key, factors, place in _TermSource(author, list_methods(author)).list_entries():
         entries.setdefault(key, []).append((factors, place))
-    held = {key: value for one in vars(author).values() if isinstance(one, dict) for key, value in one.items()}
+    spaces = [vars(sys.modules[cls.__module__]) | vars(cls) for cls in reversed(list_own_classes(author))]
+    dictionaries = [one for space in [*spaces, vars(author)] for one in space.values() if isinstance(one, dict)]
+    held = {key: value for one in dictionaries for key, value in one.items() if isinstance(key, str)}
     found = {}
     for key, listed in entries.items():
         factors = [factor for some, _ in listed for factor in some]

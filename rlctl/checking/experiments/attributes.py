@@ -19,9 +19,8 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
-from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotJudged
-from rlctl.checking.term_names import is_about_steps
+from rlctl.checking.term_names import is_about_steps, is_paid
 from rlctl.checking.term_weights import find_action_terms, find_weighed_terms
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import (
@@ -98,7 +97,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
-    if any(name.startswith(TERMS) for name in log.infos):
+    if any(is_paid(name) for name in log.infos):
         yield Fact(WEIGHED_TERMS, find_weighed_terms(instance.env))
         yield Fact(ACTION_TERMS, find_action_terms(instance.env))
 
@@ -152,10 +151,9 @@ def _play(
 
 
 def _read(attribute: Attribute) -> Numbers:
-    holder = attribute.owner if isinstance(attribute.owner, dict) else vars(attribute.owner)
     try:
-        return np.ravel(np.array(holder[attribute.key], np.float64))
-    except (KeyError, TypeError, ValueError):
+        return np.ravel(np.array(attribute.read(), np.float64))
+    except (LookupError, TypeError, ValueError):
         return np.zeros(0)
 
 
