@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -127,7 +127,6 @@ class GoalTrials:
 
     instance: Instance
     drawn: DrawnGoal
-    others: Sequence[DrawnPlace] = ()  # what else each reset draws, and no step changes
     turned_places: dict[tuple[int, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
     """Where the robot is by a turned source, by its element, seed, kind of actions and steps: goals move no robot."""
 
@@ -341,7 +340,7 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
                 goals[seed] = place.read(instance.env).tolist()
             drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies))
             yield Fact("goals", drawn)
-            yield from judges_goals.judge(GoalTrials(instance, drawn, [one for one in places if one != place]))
+            yield from judges_goals.judge(GoalTrials(instance, drawn))
             return
     yield from _find_scaled(instance, places)
     if by_chance:
@@ -362,19 +361,35 @@ def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[F
 def _find_drawn(instance: Instance) -> tuple[list[DrawnPlace], list[str]]:
     """Return the places in attributes that a reset draws by its seed and no step changes, and the names of the others
     that it draws."""
+    found = find_drawn(instance, _list_places)
+    candidates = sorted(found.stays, key=lambda name: (found.sizes[name] not in SIZES, name))[:MOST_CANDIDATES]
+    return [place for name in candidates for place in found.stays[name]], found.by_chance
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnPlaces:
+    """What resets draw, by the names of attributes."""
+
+    stays: Mapping[str, Sequence[DrawnPlace]]  # by its seed, and no step changes it
+    by_chance: list[str]  # what else they draw
+    sizes: Mapping[str, int]  # of the attributes that stay
+
+
+def find_drawn(instance: Instance, list_places: Callable[[Attribute, Attribute], list[DrawnPlace]]) -> DrawnPlaces:
+    """Return what resets draw; `list_places` returns the places in an attribute that two resets drew differently."""
     again, *drawn = (_read_after_reset(instance, seed) for seed in (FIRST_SEED, FIRST_SEED, SECOND_SEED))
-    places = {name: _list_places(drawn[0][name], drawn[1][name]) for name in drawn[0].keys() & drawn[1].keys()}
+    places = {name: list_places(drawn[0][name], drawn[1][name]) for name in drawn[0].keys() & drawn[1].keys()}
     names = [name for name, found in places.items() if found]
     seeded = [name for name in names if name in again and np.array_equal(again[name].numbers, drawn[0][name].numbers)]
     by_chance = sorted({*names} - {*seeded})
     if not seeded:
-        return [], by_chance
+        return DrawnPlaces({}, by_chance, {})
     for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=STEPS):
         pass
     after = read_attributes(instance.env)
     stays = [name for name in seeded if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
-    candidates = sorted(stays, key=lambda name: (drawn[0][name].numbers.size not in SIZES, name))[:MOST_CANDIDATES]
-    return [place for name in candidates for place in places[name]], by_chance
+    sizes = {name: drawn[0][name].numbers.size for name in stays}
+    return DrawnPlaces({name: places[name] for name in stays}, by_chance, sizes)
 
 
 def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
