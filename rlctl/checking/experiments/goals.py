@@ -33,6 +33,7 @@ SCALED_GOAL = "goal in a smaller unit"
 NEAR = 2e-3  # how near they are [m]
 PLACED_EPISODES, MOST_PLACED_EPISODES = 3, 8  # that are needed, and that are tried
 PLACED_STEPS = 3  # after which a goal is put at the place of the robot
+HELD_STEPS = 12  # after the first one, for which a goal may have to be held
 STARTS_COMPARED = 9
 MOST_SOURCES = 24  # places in the observation at which it is put
 Numbers = NDArray[np.float64]
@@ -190,7 +191,7 @@ class GoalTrials:
             place = self.find_place(source, seed)
             if place is None:  # it ends, or succeeds, too early
                 continue
-            if not self.succeeds(seed, place):
+            if not self.succeeds(seed, place, source):
                 return False
             tried += 1
             if tried == PLACED_EPISODES:
@@ -215,10 +216,13 @@ class GoalTrials:
             places |= dict(zip(chain.names, chain.read()[:, self.drawn.place.axes], strict=True))
         return places
 
-    def succeeds(self, seed: int, goal: Numbers) -> bool | None:
-        """Say whether the last of these steps is a success with the goal at a place; None if it is not played."""
+    def succeeds(self, seed: int, goal: Numbers, source: Source | None = None) -> bool | None:
+        """Say whether the last of these steps is a success with the goal at a place, or one of some later steps in
+        which it stays as far from the place of the robot by a source; None if it is not played."""
         episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
-        return None if episode.has_ended else episode.step(goal).succeeds
+        if episode.has_ended:
+            return None
+        return episode.hold(goal, source).succeeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,6 +266,18 @@ class GoalEpisode:
         succeeds = _read_success(moment)
         self.has_succeeded |= bool(succeeds)
         return GoalStep(moment.reward_number, succeeds)
+
+    def hold(self, goal: Numbers, source: Source | None = None) -> GoalStep:
+        """Step until a success, as some tasks want a goal to be held for a while: once, or, with a source, with the
+        goal as far from the robot as now."""
+        away = goal - self.read(source) if source is not None else np.zeros(goal.size)
+        step = self.step(goal)
+        for _ in range(HELD_STEPS if source is not None else 0):
+            if step.succeeds is not False or self.has_ended:
+                break
+            assert source is not None
+            step = self.step(self.read(source) + away)
+        return step
 
     def read(self, source: Source) -> Numbers:
         """Return the place of the robot by a source, after a step. Shape (size,)."""
