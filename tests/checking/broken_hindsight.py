@@ -111,3 +111,25 @@ class RL614RoverParks(RL614RoverSeeks):
 class RL614RoverParksMirrored(RL614RoverParks):
     def compare(self, one, two):
         return one[..., 0] * two[..., 0] - one[..., 1] * two[..., 1]
+
+
+class RoverParksStraight(RL614RoverParks):
+    """It is paid more where its heading is right to 15 degrees."""
+
+    tolerance = np.deg2rad(15)
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        reward = super().compute_reward(achieved_goal, desired_goal, info)
+        return reward + 0.5 * (self.compare(achieved_goal[..., 2:], desired_goal[..., 2:]) > self.least_cosine())
+
+    def least_cosine(self):
+        return np.cos(self.tolerance)
+
+
+class RL126RoverParksInDegrees(RoverParksStraight):
+    tolerance = 15.0
+
+
+class RL126RoverParksWithinANumber(RoverParksStraight):
+    def least_cosine(self):
+        return np.cos(15)

@@ -16,6 +16,8 @@ def wheels(name):
 
 
 CASES = [
+    broken("broken_hindsight", "RL126RoverParksInDegrees", "RoverParksStraight"),
+    broken("broken_hindsight", "RL126RoverParksWithinANumber", "RoverParksStraight"),
     broken("broken_quadrotor", "RL115QuadrotorActsLate", "Quadrotor"),
     broken("broken_quadrotor", "RL124QuadrotorWrongWay", "Quadrotor"),
     broken("broken_quadrotor", "RL616QuadrotorLateReward", "Quadrotor", slow=True),
