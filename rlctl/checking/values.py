@@ -193,10 +193,14 @@ def _is_own(value: Any) -> bool:
 
 
 def shape_like(value: Any, numbers: NDArray[np.float64]) -> Any:
-    """Return numbers in the form of a value: an array, a list, a tuple or a number."""
+    """Return numbers in the form of a value: an array, a number, or a list or a tuple of such."""
     if isinstance(value, np.ndarray):
         return numbers.reshape(value.shape)
-    return type(value)(numbers.tolist()) if isinstance(value, list | tuple) else float(numbers[0])
+    if not isinstance(value, list | tuple | collections.deque):
+        return float(numbers[0])
+    parts = np.split(numbers, np.cumsum([np.size(item) for item in value])[:-1])
+    items = [shape_like(item, part) for item, part in zip(value, parts, strict=True)]
+    return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
 
 
 def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> list[str]:

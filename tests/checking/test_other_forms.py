@@ -1,4 +1,4 @@
-"""Mistakes of a cart, a quadrotor and a gripper whose states, terms and wishes have other forms and names."""
+"""Mistakes of robots whose states, goals, terms and wishes have other forms and names than those of other tests."""
 
 import pytest
 
@@ -24,6 +24,10 @@ CASES = [
     broken("broken_quadrotor", "RL630QuadrotorSignedRates", "Quadrotor", slow=True),
     broken("broken_quadrotor", "RL632QuadrotorOtherElement", "Quadrotor"),
     broken("broken_quadrotor", "RL832QuadrotorTurnsFast", "Quadrotor"),
+    *(
+        broken("broken_way_points", name, "WayPoints", slow=True)
+        for name in ("RL125WayPointsTurned", "RL618WayPointsLookRound", "RL627WayPointsOldGoal")
+    ),
     wheels("RL123WheelsInTheWorld"),
     wheels("RL124WheelsTurnedTwice"),
     wheels("RL616WheelsLateReward"),
