@@ -158,11 +158,11 @@ def _list_pushes(log: AttributeLog, velocity: Numbers, matrices: Numbers) -> Num
 
 
 def _measure_thrusts(acceleration: Numbers, matrices: Numbers, fall: float) -> float:
-    """Return how far thrusts are from one axis of the frame, in the plane; 1 in space, where other measures tell it."""
+    """Return how far thrusts are from one axis of the frame; those of rotors are near one, also where they are late."""
     size = acceleration.shape[1]
     thrusts = np.einsum("nji,nj->ni", matrices, acceleration + fall * np.eye(size)[-1])
     sizes = np.linalg.eigvalsh(thrusts.T @ thrusts)
-    return float(sizes[0] / max(sizes[-1], 1e-12)) if size == 2 else 1.0
+    return float(sizes[-2] / max(sizes[-1], 1e-12))
 
 
 def _find_rest(columns: Numbers, wanted: Numbers) -> float:

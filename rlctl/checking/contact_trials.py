@@ -1,7 +1,7 @@
 """Plays episodes in which the environment gets other contacts from its engine than there are."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.values import find_numbers, flatten, list_parts
 from rlctl.checking.world_logs import LoggedWorld
-from rlctl.checking.worlds import Array
+from rlctl.checking.worlds import Array, Link
 from rlctl.environments.bullet_calls import Contacts
 from rlctl.environments.info import find_mujoco
 
@@ -119,3 +119,13 @@ def play_in_mujoco(watched: WatchedWorlds, other: MujocoContacts, actions: str =
         return _play(watched.instance, lambda: was_shown, actions)
     finally:
         calls.after_step, calls.after_forward = type(calls).after_step, type(calls).after_forward
+
+
+def make_contacts(asked: Sequence[int | None], bump: tuple[Link, Link]) -> Iterator[tuple[Any, ...]]:
+    """Yield a contact as getContactPoints returns it, if it has the bodies and links that are asked for."""
+    nothing = (0.0, 0.0, 0.0)
+    for one, two in (bump, bump[::-1]):
+        given = (one[0], two[0], one[1], two[1])
+        if all(wanted in (None, value) for wanted, value in zip(asked, given, strict=False)):
+            yield (0, *given, nothing, nothing, (0.0, 0.0, 1.0), -1e-3, 10.0, 0.0, nothing, 0.0, nothing)
+            return

@@ -1,12 +1,14 @@
 """Recorded rewards, their terms and successes, as the rules about them read them."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rule import NotApplicable, NotJudged
+from rlctl.checking.term_names import split_name
 from rlctl.environments.success import SUCCESS
 
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
@@ -14,8 +16,14 @@ DISCOUNT = 0.99  # per step: what is hundreds of steps away hardly counts
 TERMS = "reward_terms/"
 RAW_TERMS = "metrics/"
 """The same without their weights, of tasks."""
+REWARD_WORDS = {"reward", "rewards", "rew", "rews"}
+TOTAL_WORDS = {"cumulative", "episode", "mean", "return", "scale", "sum", "total"}
+"""Of the names of what is no term."""
 SUM_TOLERANCE = 1e-3  # part of the reward or of 1: terms may be rounded for the log
 FEW_WRONG = 0.02  # part of the steps: the last of an episode may have a bonus
+ROUNDS = 5  # of a fit without the steps that have a bonus of their own
+ORDINARY = 0.95  # part of the steps that have none
+LEAST_WEIGHT = 1e-6  # what is 0 but for rounding
 ENOUGH_STEPS = 50  # With fewer steps no rule judges what never happens
 
 
@@ -30,7 +38,11 @@ def require_readable(records: Records) -> list[CheckedEpisode]:
 
 
 def require_rewarded(records: Records) -> list[CheckedEpisode]:
-    """Return the same, if every reward is a finite number."""
+    """Return the same, if every reward is a finite number; with reward terms by `weigh_terms`."""
+    return weigh_terms(_require_finite(records))
+
+
+def _require_finite(records: Records) -> list[CheckedEpisode]:
     episodes = require_readable(records)
     if not all(episode.reward_is_number.all() for episode in episodes):
         raise NotJudged("the reward is not a number (RL204)")
@@ -48,10 +60,66 @@ def require_enough(episodes: list[CheckedEpisode]) -> list[CheckedEpisode]:
 
 def require_terms(records: Records) -> list[CheckedEpisode]:
     """Return the rewarded episodes with reward terms; raises `NotApplicable` where there are none."""
-    episodes = [episode for episode in require_rewarded(records) if has_terms(episode)]
-    if not episodes:
+    return _choose_with_terms(require_rewarded(records))
+
+
+def require_logged_terms(records: Records) -> list[CheckedEpisode]:
+    """Return the same, with the terms as they are in info."""
+    return _choose_with_terms(_require_finite(records))
+
+
+def _choose_with_terms(episodes: Sequence[CheckedEpisode]) -> list[CheckedEpisode]:
+    chosen = [episode for episode in episodes if has_terms(episode)]
+    if not chosen:
         raise NotApplicable("no reward_terms in info")
+    return chosen
+
+
+def weigh_terms(episodes: list[CheckedEpisode]) -> list[CheckedEpisode]:
+    """Return episodes whose terms are the reward, where that can be had: terms without their weights get them, and are
+    `RAW_TERMS` too, as those of tasks; numbers of info that are named after the reward are terms if they add up."""
+    if any(has_terms(episode) for episode in episodes):
+        with_terms = [episode for episode in episodes if has_terms(episode)]
+        is_raw = len(with_terms) == len(episodes) and find_wrong_sums(with_terms).any()
+        return (_apply_weights(episodes) or episodes) if is_raw else episodes
+    for names in _list_groups(episodes):
+        renamed = [_rename(episode, names) for episode in episodes]
+        if all(has_terms(episode) for episode in renamed):
+            found = renamed if not find_wrong_sums(renamed).any() else _apply_weights(renamed)
+            if found:
+                return found
     return episodes
+
+
+def _list_groups(episodes: Sequence[CheckedEpisode]) -> list[dict[str, str]]:
+    """Return the numbers of info that may be reward terms: new names by old ones, for each dictionary that is named
+    after the reward, and for single numbers that are."""
+    groups: dict[str, dict[str, str]] = {}
+    for name in dict.fromkeys(name for episode in episodes for name in episode.infos):
+        folder, _, term = name.rpartition("/")
+        words = set(split_name(folder or term))
+        if words & REWARD_WORDS and not words & TOTAL_WORDS | set(split_name(term)) & TOTAL_WORDS:
+            groups.setdefault(folder, {})[name] = TERMS + term
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _rename(episode: CheckedEpisode, names: Mapping[str, str]) -> CheckedEpisode:
+    return dataclasses.replace(episode, infos={names.get(name, name): one for name, one in episode.infos.items()})
+
+
+def _apply_weights(episodes: Sequence[CheckedEpisode]) -> list[CheckedEpisode]:
+    """Return the episodes with weighted terms, and those without weights as `RAW_TERMS`; empty where no weights make
+    the terms the reward. A term that is always 0 has no weight that could be known."""
+    weights = find_weights(episodes)
+    found = []
+    for episode in episodes if weights else ():
+        infos = dict(episode.infos)
+        for name, weight in weights.items():
+            if (series := infos.get(TERMS + name)) is not None:
+                infos[RAW_TERMS + name] = series
+                infos[TERMS + name] = dataclasses.replace(series, values=weight * series.values)
+        found.append(dataclasses.replace(episode, infos=infos))
+    return found
 
 
 def has_terms(episode: CheckedEpisode) -> bool:
@@ -100,6 +168,32 @@ def find_wrong_sums(episodes: Sequence[CheckedEpisode]) -> NDArray[np.float64]:
     off = np.nan_to_num(off)  # a step without terms
     is_wrong: NDArray[np.bool_] = off > SUM_TOLERANCE
     return np.where(is_wrong & (is_wrong.mean() > FEW_WRONG), off, 0.0)
+
+
+def find_weights(episodes: Sequence[CheckedEpisode]) -> dict[str, float]:
+    """Return constant weights with which all terms, and a constant, are the reward, also those of a part of the steps
+    that have a bonus of their own; empty where there are none. A term that is always 0 has none."""
+    terms = join_terms(episodes)
+    rewards = np.concatenate([episode.rewards for episode in episodes])
+    columns = [values for values in terms.values() if len(values) == len(rewards)]
+    if not columns or len(columns) < len(terms):
+        return {}
+    table = np.column_stack([*columns, np.ones(len(rewards))])
+    known = np.isfinite(table).all(axis=1) & np.isfinite(rewards)
+    table, rewards = table[known], rewards[known]
+    allowed = SUM_TOLERANCE * np.maximum(1.0, np.abs(rewards))
+    chosen = np.arange(len(rewards))
+    weights = np.zeros(table.shape[1])
+    for _ in range(ROUNDS):
+        weights = np.linalg.lstsq(table[chosen], rewards[chosen], rcond=None)[0]
+        off = np.abs(table @ weights - rewards)
+        if np.mean(off <= allowed) >= ORDINARY:
+            found = zip([*terms, "constant"], weights.tolist(), strict=True)
+            used = {name: weight for name, weight in found if abs(weight) > LEAST_WEIGHT}
+            is_zero = {name for name, values in terms.items() if not values.any()}
+            return used if used.keys() | is_zero >= terms.keys() else {}
+        chosen = np.argsort(off)[: int(ORDINARY * len(rewards))]
+    return {}
 
 
 def reports_success(episodes: Sequence[CheckedEpisode]) -> bool:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -17,6 +18,10 @@ LEAST_MOTION = 1e-6
 SAME = 0.99  # correlation of a change and of what changes by it
 NEAR = 0.25  # relative error of a time that is estimated from positions and velocities
 EXACT = 1e-3
+MOVING, VARIES = 0.1, 0.2  # parts of the largest speed that count, and of the mean by which speeds have to differ
+CLOSE, USUAL = 0.05, 0.9  # relative error of a time, and part of the steps in which it is so small
+FEWEST_STEPS = 20
+UNIT = 1e-6  # how far from 1 the length of a quaternion may be
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,3 +139,76 @@ def find_rates(log: AttributeLog, rows: Numbers) -> list[tuple[int, int, float]]
         for column, rate in enumerate(rate_of.tolist())
         if moving[column] and best[column, rate] > SAME and seconds[column, rate] > 0
     ]
+
+
+@dataclasses.dataclass(frozen=True)
+class NamedRate:
+    """An attribute that changes by another one times a time."""
+
+    name: str
+    rate: str
+    seconds: float  # in each step [s]
+
+
+def list_named_rates(log: AttributeLog) -> list[NamedRate]:
+    """Return which attributes change by which others, and which pairs of them are as long a way as others are fast: a
+    place in the world's axes and a velocity in those of the robot."""
+    single = [NamedRate(log.names[column], log.names[rate], s) for column, rate, s in find_rates(log, log.values)]
+    rates = {one.name for one in single} | {one.rate for one in single}
+    free = [column for column in range(len(log.names)) if log.names[column] not in rates]
+    lengths = [
+        NamedRate(_name_pair(log, column), f"the length of {_name_pair(log, rate)}", seconds)
+        for column, rate, seconds in _find_lengths(log, [c for c in free if c + 1 in free])
+    ]
+    return [*single, *lengths, *_find_turns(log)]
+
+
+def _name_pair(log: AttributeLog, column: int) -> str:
+    return f"({log.names[column]}, {log.names[column + 1]})"
+
+
+def _find_lengths(log: AttributeLog, columns: Sequence[int]) -> Iterator[tuple[int, int, float]]:
+    """Yield which pair of columns moves by the length of which other pair, and for how long [s]."""
+    steps = np.flatnonzero(log.is_step)
+    changes, middle = log.changes(log.values), (log.values[steps] + log.values[steps - 1]) / 2
+    if len(steps) < FEWEST_STEPS:
+        return
+    for column in columns:
+        way = np.linalg.norm(changes[:, column : column + 2], axis=1)
+        for other in columns:
+            if abs(other - column) > 1:
+                seconds = _find_factor(way, np.linalg.norm(middle[:, other : other + 2], axis=1))
+                if seconds is not None:
+                    yield column, other, seconds
+
+
+def _find_turns(log: AttributeLog) -> Iterator[NamedRate]:
+    """Yield which quaternion turns by which angular velocity."""
+    steps = np.flatnonzero(log.is_step)
+    if len(steps) < FEWEST_STEPS:
+        return
+    middle = (log.values[steps] + log.values[steps - 1]) / 2
+    for column in range(log.values.shape[1] - 3):
+        quaternions = log.values[:, column : column + 4]
+        if np.abs(np.linalg.norm(quaternions, axis=1) - 1).max() > UNIT:
+            continue
+        cosines = np.abs(np.einsum("ni,ni->n", quaternions[steps], quaternions[steps - 1]))
+        angles = 2 * np.arccos(np.clip(cosines, 0.0, 1.0))
+        for other in range(log.values.shape[1] - 2):
+            if column - 3 < other < column + 4:
+                continue
+            seconds = _find_factor(angles, np.linalg.norm(middle[:, other : other + 3], axis=1))
+            if seconds is not None:
+                rate = f"({log.names[other]} to {log.names[other + 2]})"
+                yield NamedRate(f"the turn of ({log.names[column]} to {log.names[column + 3]})", rate, seconds)
+
+
+def _find_factor(ways: Numbers, speeds: Numbers) -> float | None:
+    """Return by which time speeds have to be multiplied to be ways, if it is nearly always the same [s]."""
+    is_fast = speeds > MOVING * speeds.max(initial=0.0)
+    if speeds.std() < VARIES * speeds.mean() or is_fast.sum() < FEWEST_STEPS:
+        return None
+    times = ways[is_fast] / speeds[is_fast]
+    seconds = float(np.median(times))
+    is_same = seconds > LEAST_MOTION and np.mean(np.abs(times / seconds - 1) < CLOSE) > USUAL
+    return seconds if is_same else None

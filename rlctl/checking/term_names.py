@@ -9,10 +9,12 @@ ACTION_WORDS = {
 ENERGY_WORDS = {"energy", "power"}
 COST_WORDS = {"cost", "costs", "penalty", "penalties", "punishment"}
 """What lowers a reward, whatever it is computed from."""
+CHANGE_WORDS = {"change", "changes", "changing", "chatter", "delta", "diff", "difference", "jitter"}
+"""What happens to an action from step to step, where nothing else is named that changes."""
 NEUTRAL_WORDS = {
-    "acc", "acceleration", "change", "consumption", "delta", "diff", "difference", "dof", "first", "input", "inputs",
-    "joint", "joints", "l1", "l2", "magnitude", "mean", "motor", "motors", "norm", "order", "r", "rate", "reg",
-    "regularization", "rew", "reward", "second", "size", "squared", "sum", "term", "total", "usage", "use",
+    "acc", "acceleration", "consumption", "dof", "first", "input", "inputs", "joint", "joints", "l1", "l2", "magnitude",
+    "mean", "motor", "motors", "norm", "order", "r", "rate", "reg", "regularization", "rew", "reward", "second", "size",
+    "squared", "sum", "term", "total", "usage", "use",
 }  # fmt: skip
 """What may stand beside an action word without saying that only a part, or what is beyond a limit, counts."""
 ERROR_WORDS = {
@@ -43,7 +45,7 @@ def split_name(name: str) -> list[str]:
 def is_about_actions(name: str, more: Collection[str] = ()) -> bool:
     """Say whether a term is the size of the actions, of their change or of what motors do, and of nothing else."""
     words, about = set(split_name(name)), ACTION_WORDS | set(more)
-    return bool(words & about) and words <= about | COST_WORDS | NEUTRAL_WORDS
+    return bool(words & about) and words <= about | COST_WORDS | NEUTRAL_WORDS | CHANGE_WORDS
 
 
 def is_cost(name: str) -> bool:
@@ -63,6 +65,12 @@ def is_about_steps(name: str) -> bool:
     words = set(split_name(name))
     is_lift = bool(words & STEPPING_WORDS) or {"air", "time"} <= words or ("height" in words and _has_feet(words))
     return is_lift and not words & COST_WORDS and not words & GRASP_WORDS
+
+
+def is_about_landings(name: str) -> bool:
+    """Say whether a term is about how long feet were in the air, which is known when they come down."""
+    words = set(split_name(name))
+    return is_about_steps(name) and bool(words & {"air", "airtime"})
 
 
 def _has_feet(words: Collection[str]) -> bool:

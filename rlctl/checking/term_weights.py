@@ -16,6 +16,9 @@ from rlctl.checking.values import NUMBERS, find_author, list_own_classes
 CONVERSIONS = {"float", "float32", "float64", "item", "asarray", "array"}
 """Functions that return what they are given."""
 DEEPEST = 6  # names and methods that are followed
+SHALLOW = 3  # the same, from a term to the action: what is further away is the robot, which the action moves
+LIMITS = {"clip", "fmax", "fmin", "heaviside", "max", "maximum", "min", "minimum", "relu", "where"}
+"""Functions with which a term may be 0 where nothing exceeds a limit."""
 COMPUTED, UNKNOWN = "computed", math.nan  # what else than a known number a factor may be
 Factor = float | str
 Place = tuple[str, int]
@@ -84,6 +87,41 @@ class _TermSource:
                 return [COMPUTED]
         return [UNKNOWN]
 
+    def is_of_action(self, value: ast.expr, function: ast.FunctionDef, depth: int = 0) -> bool | None:
+        """Say whether a value is computed from the action; None where a limit or a condition decides what counts."""
+        found = False
+        for node in ast.walk(value):
+            parts: list[tuple[ast.expr, ast.FunctionDef]] = []
+            match node:
+                case ast.Compare() | ast.IfExp() | ast.BoolOp():
+                    return None
+                case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in LIMITS:
+                    return None
+                case ast.Name(id=name, ctx=ast.Load()) if name in {"action", "actions"}:
+                    found = True
+                case ast.Name(id=name, ctx=ast.Load()):
+                    parts = [(assigned, function) for assigned in _find_assigned(function, name)]
+                case ast.Attribute(value=ast.Name(id="self"), attr=name, ctx=ast.Load()):
+                    parts = self._list_sources(name)
+            for part, inside in parts if depth < SHALLOW else ():
+                is_part = self.is_of_action(part, inside, depth + 1)
+                if is_part is None:
+                    return None
+                found |= is_part
+        return found
+
+    def _list_sources(self, name: str) -> list[tuple[ast.expr, ast.FunctionDef]]:
+        """Return what the methods assign to an attribute, and what a method of this name returns."""
+        found: list[tuple[ast.expr, ast.FunctionDef]] = []
+        for _, method in self.methods:
+            for node in ast.walk(method):
+                match node:
+                    case ast.Assign(targets=[ast.Attribute(value=ast.Name(id="self"), attr=attr)], value=assigned):
+                        found += [(assigned, method)] if attr == name else []
+                    case ast.Return(value=ast.expr() as returned) if method.name == name:
+                        found.append((returned, method))
+        return found
+
     def _read_number(self, value: ast.expr) -> float:
         """Return the present number of a name, an attribute or an entry; `UNKNOWN` where it is none."""
         found = self._look_up(value)
@@ -112,7 +150,9 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
     entries: dict[str, list[tuple[list[Factor], Place]]] = {}
     for key, factors, place in _TermSource(author, list_methods(author)).list_entries():
         entries.setdefault(key, []).append((factors, place))
-    held = {key: value for one in vars(author).values() if isinstance(one, dict) for key, value in one.items()}
+    spaces = [vars(sys.modules[cls.__module__]) | vars(cls) for cls in reversed(list_own_classes(author))]
+    dictionaries = [one for space in [*spaces, vars(author)] for one in space.values() if isinstance(one, dict)]
+    held = {key: value for one in dictionaries for key, value in one.items() if isinstance(key, str)}
     found = {}
     for key, listed in entries.items():
         factors = [factor for some, _ in listed for factor in some]
@@ -121,6 +161,19 @@ def find_weighed_terms(env: Any) -> dict[str, Place]:
         if COMPUTED in factors and weights and all(isinstance(w, float) and w and math.isfinite(w) for w in weights):
             found[key] = next(place for some, place in listed if COMPUTED in some)
     return found
+
+
+def find_action_terms(env: Any) -> set[str]:
+    """Return the keys of dictionaries whose values the source computes from the action, without a limit or a
+    condition."""
+    author = find_author(env)
+    source = _TermSource(author, list_methods(author))
+    found: dict[str, list[bool | None]] = {}
+    for _, method in source.methods:
+        for node in ast.walk(method):
+            for key, value in _read_entries(node):
+                found.setdefault(key, []).append(source.is_of_action(value, method))
+    return {key for key, each in found.items() if all(each)}
 
 
 def list_methods(author: Any) -> list[tuple[str, ast.FunctionDef]]:

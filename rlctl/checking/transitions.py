@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, Records
 from rlctl.checking.rule import NotJudged
-from rlctl.environments.leaves import Leaf, pick
+from rlctl.environments.leaves import Leaf, name_element, pick
 from rlctl.environments.success import SUCCESS
 
 ROLES = ("episodes", "seeds", "starts", "search")  # each plays other states; the other roles repeat an episode
@@ -48,6 +48,15 @@ class Transitions:
 def find_float_leaves(leaves: Sequence[Leaf]) -> list[int]:
     """Return the places of the leaves that observations are read from."""
     return [index for index, leaf in enumerate(leaves) if leaf.supported and leaf.dtype.startswith("float")]
+
+
+def name_floats(leaves: Sequence[Leaf]) -> list[str]:
+    """Return the names of these numbers, in the same order."""
+    return [
+        name_element(leaves[index], flat)
+        for index in find_float_leaves(leaves)
+        for flat in range(int(np.prod(leaves[index].shape)))
+    ]
 
 
 def flatten_floats(leaves: Sequence[Leaf], observation: Any) -> NDArray[np.float64]:

@@ -81,6 +81,7 @@ def read_flag(flag: Any) -> bool:
 
 MOST_NUMBERS = 64  # larger arrays are buffers, images or tables, no single quantity
 MOST_ATTRIBUTES, DEEPEST = 500, 2  # Attributes of attributes are read, but no deeper
+MOST_ITEMS = 16  # of a list or a tuple of unlike things, such as a state
 Generator = np.random.Generator | np.random.RandomState | random.Random
 NO_GENERATORS = {id(np.random.mtrand._rand), id(random._inst)}  # of the whole process: RL309 watches them
 
@@ -119,6 +120,7 @@ class Attribute:
     owner: Any  # The object, or the dictionary, that holds it
     key: str
     value: Any  # A copy; of a generator the generator itself
+    item: int | None = None  # Its place where the attribute is a list or a tuple of unlike things
 
     @property
     def numbers(self) -> NDArray[np.float64]:
@@ -127,10 +129,23 @@ class Attribute:
 
     def assign(self, value: Any) -> None:
         """Replace the value in the environment."""
+        value = copy.deepcopy(value)
+        if self.item is not None:
+            whole = self._read_whole()
+            items = [*whole[: self.item], value, *whole[self.item + 1 :]]
+            value = type(whole)(*items) if hasattr(whole, "_fields") else type(whole)(items)
         if isinstance(self.owner, dict):
-            self.owner[self.key] = copy.deepcopy(value)
+            self.owner[self.key] = value
         else:
-            setattr(self.owner, self.key, copy.deepcopy(value))
+            setattr(self.owner, self.key, value)
+
+    def read(self) -> Any:
+        """Return the present value in the environment; raises `LookupError` where it is gone."""
+        whole = self._read_whole()
+        return whole if self.item is None else whole[self.item]
+
+    def _read_whole(self) -> Any:
+        return (self.owner if isinstance(self.owner, dict) else vars(self.owner))[self.key]
 
 
 def read_attributes(env: Any) -> dict[str, Attribute]:
@@ -148,6 +163,10 @@ def read_attributes(env: Any) -> dict[str, Attribute]:
             if _is_quantity(value) or (isinstance(value, Generator) and id(value) not in NO_GENERATORS):
                 value = value if isinstance(value, Generator) else copy.deepcopy(value)
                 attributes[path] = Attribute(path, owner, key, value)
+            elif isinstance(value, list | tuple) and 0 < len(value) <= MOST_ITEMS:
+                items_of_value = [(i, item) for i, item in enumerate(value) if _is_quantity(item)]
+                for i, item in items_of_value if len(items_of_value) == len(value) else ():
+                    attributes[f"{path}[{i}]"] = Attribute(f"{path}[{i}]", owner, key, copy.deepcopy(item), i)
             elif depth < DEEPEST and id(value) not in seen and _is_own(value):
                 visit(value, path, depth + 1)
 
@@ -174,10 +193,14 @@ def _is_own(value: Any) -> bool:
 
 
 def shape_like(value: Any, numbers: NDArray[np.float64]) -> Any:
-    """Return numbers in the form of a value: an array, a list, a tuple or a number."""
+    """Return numbers in the form of a value: an array, a number, or a list or a tuple of such."""
     if isinstance(value, np.ndarray):
         return numbers.reshape(value.shape)
-    return type(value)(numbers.tolist()) if isinstance(value, list | tuple) else float(numbers[0])
+    if not isinstance(value, list | tuple | collections.deque):
+        return float(numbers[0])
+    parts = np.split(numbers, np.cumsum([np.size(item) for item in value])[:-1])
+    items = [shape_like(item, part) for item, part in zip(value, parts, strict=True)]
+    return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
 
 
 def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> list[str]:

@@ -63,6 +63,18 @@ class RL827FeetPhysicsTime(Feet):
         return self.dt / self.substeps
 
 
+class FeetByHertz(Feet):
+    """How often its clock goes round is declared."""
+
+    gait_hz = 1.25
+    gait_period = property(lambda self: 1 / self.gait_hz)
+
+
+class RL826FeetSlowHertz(FeetByHertz):
+    def clock_step(self):
+        return self.dt / self.substeps
+
+
 class FeetBySine(Feet):
     """Only a sine of the clock is observed."""
 

@@ -73,3 +73,63 @@ class RL614ReacherSeeks(Hindsight, Reacher):
 
 
 class RL614ReacherOwnGoal(OwnGoal, RL614ReacherSeeks): ...
+
+
+class RL614RoverParks(RL614RoverSeeks):
+    """Its goal has a heading, too."""
+
+    rlctl_ignore = {"RL611": "its success is that of the place"}
+
+    def draw_goal(self):
+        self.parked = self.np_random.uniform(-3, 3)
+        return super().draw_goal()
+
+    def __init__(self):
+        super().__init__()
+        goal = spaces.Box(-np.inf, np.inf, (4,), np.float32)
+        self.observation_space = spaces.Dict(
+            observation=self.observation_space["observation"], achieved_goal=goal, desired_goal=goal
+        )
+
+    def with_goals(self, observation):
+        achieved = [*self.place, np.cos(self.heading), np.sin(self.heading)]
+        desired = [*self.goal, np.cos(self.parked), np.sin(self.parked)]
+        return {
+            "observation": observation,
+            "achieved_goal": np.float32(achieved),
+            "desired_goal": np.float32(desired),
+        }
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        distance = np.linalg.norm((achieved_goal - desired_goal)[..., :2], axis=-1)
+        return -distance - 0.3 * (1 - self.compare(achieved_goal[..., 2:], desired_goal[..., 2:]))
+
+    def compare(self, one, two):
+        return (one * two).sum(axis=-1)
+
+
+class RL614RoverParksMirrored(RL614RoverParks):
+    def compare(self, one, two):
+        return one[..., 0] * two[..., 0] - one[..., 1] * two[..., 1]
+
+
+class RoverParksStraight(RL614RoverParks):
+    """It is paid more where its heading is right to 15 degrees."""
+
+    tolerance = np.deg2rad(15)
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        reward = super().compute_reward(achieved_goal, desired_goal, info)
+        return reward + 0.5 * (self.compare(achieved_goal[..., 2:], desired_goal[..., 2:]) > self.least_cosine())
+
+    def least_cosine(self):
+        return np.cos(self.tolerance)
+
+
+class RL126RoverParksInDegrees(RoverParksStraight):
+    tolerance = 15.0
+
+
+class RL126RoverParksWithinANumber(RoverParksStraight):
+    def least_cosine(self):
+        return np.cos(15)

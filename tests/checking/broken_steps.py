@@ -206,3 +206,54 @@ class RL629GripperAnywhere(Gripper):
     def result(self, reward, success):
         *returned, info = super().result(reward, success)
         return *returned, {**info, "is_success": self.distance() < 0.03}
+
+
+class RL628HopperLandsAlways(HopperSteps):
+    """A foot on the ground counts as one that comes down, after no time in the air."""
+
+    limit = 220
+
+    def pay(self, touches):
+        return ((self.in_air - 0.1) * touches).sum()
+
+
+class GripperHolds(Gripper):
+    """It is paid while its fingers touch the cube."""
+
+    def touches(self):
+        fingers = {self.model.body(name).geomadr[0] for name in ("left", "right")}
+        cube = self.model.body("cube").geomadr[0]
+        pairs = [{int(contact.geom1), int(contact.geom2)} for contact in self.data.contact]
+        return [{finger, cube} in pairs for finger in fingers]
+
+    def is_paid(self):
+        return all(self.touches())
+
+    def list_terms(self):
+        return {**super().list_terms(), "grasp_bonus": 0.5 * self.is_paid()}
+
+    def result(self, reward, success):
+        *returned, info = super().result(reward, success)
+        return *returned, {**info, "is_success": self.distance() < 0.03}
+
+
+class RL631GripperOneFinger(GripperHolds):
+    def is_paid(self):
+        return any(self.touches())
+
+
+class GripperHoldsAnything(GripperHolds):
+    """What it calls a touch is one of any finger."""
+
+    def list_terms(self):
+        return {"reach": 1 - np.tanh(5 * self.distance()), "touch_bonus": 0.5 * any(self.touches())}
+
+
+class RL816GripperOpensOutwards(Gripper):
+    """Its fingers open in the direction of their axes."""
+
+    def move(self, action):
+        super().move(action * [1, 1, 0])
+        self.data.ctrl[2] = -0.0225 * (1 + action[2])
+        mujoco.mj_step(self.model, self.data, 4)
+        mujoco.mj_forward(self.model, self.data)

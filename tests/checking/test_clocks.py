@@ -13,6 +13,7 @@ def broken(file, name, twin, rule, **settings):
 
 PAIRS = (
     ("broken_clocks", "RL826FeetSlowClock", "Feet"),
+    ("broken_clocks", "RL826FeetSlowHertz", "FeetByHertz"),
     ("broken_clocks", "RL826FeetCountsAll", "FeetBySine"),
     ("broken_clocks", "RL826HopperSlowTime", "HopperByTime"),
     ("broken_clocks", "RL826PusherSlowTime", "PusherBySeconds"),
@@ -22,6 +23,7 @@ PAIRS = (
     ("broken_steps", "RL628FeetPaidAtRest", "Lifts"),
     ("broken_steps", "RL628HopperPaidAtRest", "HopperSteps"),
     ("broken_steps", "RL628CrawlerPaidAtRest", "CrawlerLifts"),
+    ("broken_steps", "RL628HopperLandsAlways", "HopperSteps"),
     ("broken_steps", "RL629PickerAnywhere", "Picker"),
     ("broken_steps", "RL629GripperAnywhere", "Gripper"),
     ("broken_waypoints", "RL627CourseOldGoal", "Course"),

@@ -95,6 +95,9 @@ CASES = [
     case("broken_goals.py:RL614NumberlessReward", ("RL614", "error"), twin="broken_goals.py:RL614NestedGoal"),
     case("broken_hindsight.py:RL614RoverOwnGoal", ("RL614", "error"), twin="broken_hindsight.py:RL614RoverSeeks"),
     case(
+        "broken_hindsight.py:RL614RoverParksMirrored", ("RL614", "warning"), twin="broken_hindsight.py:RL614RoverParks"
+    ),
+    case(
         "broken_hindsight.py:RL614ArmOwnGoal",
         ("RL614", "error"),
         twin="broken_hindsight.py:RL614ArmSparse",

@@ -19,10 +19,9 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
-from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotJudged
-from rlctl.checking.term_names import is_about_steps
-from rlctl.checking.term_weights import find_weighed_terms
+from rlctl.checking.term_names import is_about_steps, is_paid
+from rlctl.checking.term_weights import find_action_terms, find_weighed_terms
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import (
     NUMBERS,
@@ -45,6 +44,8 @@ FEW_STEPS = 3  # in which an attribute has to change to be logged
 MOST_NUMBERS = 400
 WEIGHED_TERMS = "weighed terms"
 """The fact with what `find_weighed_terms` returns."""
+ACTION_TERMS = "terms of actions"
+"""The fact with what `find_action_terms` returns."""
 RATES = ("render_fps", "video.frames_per_second")
 """Where metadata has the frame rate [Hz]."""
 Numbers = NDArray[np.float64]
@@ -96,8 +97,9 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
-    if any(name.startswith(TERMS) for name in log.infos):
+    if any(is_paid(name) for name in log.infos):
         yield Fact(WEIGHED_TERMS, find_weighed_terms(instance.env))
+        yield Fact(ACTION_TERMS, find_action_terms(instance.env))
 
 
 @dataclasses.dataclass
@@ -149,10 +151,9 @@ def _play(
 
 
 def _read(attribute: Attribute) -> Numbers:
-    holder = attribute.owner if isinstance(attribute.owner, dict) else vars(attribute.owner)
     try:
-        return np.ravel(np.array(holder[attribute.key], np.float64))
-    except (KeyError, TypeError, ValueError):
+        return np.ravel(np.array(attribute.read(), np.float64))
+    except (LookupError, TypeError, ValueError):
         return np.zeros(0)
 
 
@@ -221,7 +222,7 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) 
         seconds=np.array([look.seconds for look in looks]),
         physics_s=_Engine.find(instance, clients).physics_s,
         episodes=np.array([look.episode for look in looks]),
-        declared={name: value for name, value in _find_declared(instance.env).items() if name not in names},
+        declared={name: value for name, value in find_declared_numbers(instance.env).items() if name not in names},
         literals=tuple(sorted(_find_literals(instance.env))),
     )
 
@@ -230,7 +231,7 @@ def _names(looks: list[_LoggedLook]) -> list[str]:
     return list(dict.fromkeys(name for look in looks for name in look.attributes))
 
 
-def _find_declared(env: Any) -> dict[str, float]:
+def find_declared_numbers(env: Any) -> dict[str, float]:
     """Return the numbers of the author's object, of its classes, and of the modules of these, by name."""
     author = find_author(env)
     found: dict[str, float] = {}

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,7 @@ SCALED_GOAL = "goal in a smaller unit"
 NEAR = 2e-3  # how near they are [m]
 PLACED_EPISODES, MOST_PLACED_EPISODES = 3, 8  # that are needed, and that are tried
 PLACED_STEPS = 3  # after which a goal is put at the place of the robot
+HELD_STEPS = 12  # after the first one, for which a goal may have to be held
 STARTS_COMPARED = 9
 MOST_SOURCES = 24  # places in the observation at which it is put
 Numbers = NDArray[np.float64]
@@ -190,7 +191,8 @@ class GoalTrials:
             place = self.find_place(source, seed)
             if place is None:  # it ends, or succeeds, too early
                 continue
-            if not self.succeeds(seed, place):
+            # A place by itself may be anything: to hold the goal at each takes long.
+            if not self.succeeds(seed, place, source if source[1] else None):
                 return False
             tried += 1
             if tried == PLACED_EPISODES:
@@ -215,10 +217,13 @@ class GoalTrials:
             places |= dict(zip(chain.names, chain.read()[:, self.drawn.place.axes], strict=True))
         return places
 
-    def succeeds(self, seed: int, goal: Numbers) -> bool | None:
-        """Say whether the last of these steps is a success with the goal at a place; None if it is not played."""
+    def succeeds(self, seed: int, goal: Numbers, source: Source | None = None) -> bool | None:
+        """Say whether the last of these steps is a success with the goal at a place, or one of some later steps in
+        which it stays as far from the place of the robot by a source; None if it is not played."""
         episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
-        return None if episode.has_ended else episode.step(goal).succeeds
+        if episode.has_ended:
+            return None
+        return episode.hold(goal, source).succeeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,6 +267,18 @@ class GoalEpisode:
         succeeds = _read_success(moment)
         self.has_succeeded |= bool(succeeds)
         return GoalStep(moment.reward_number, succeeds)
+
+    def hold(self, goal: Numbers, source: Source | None = None) -> GoalStep:
+        """Step until a success, as some tasks want a goal to be held for a while: once, or, with a source, with the
+        goal as far from the robot as now."""
+        away = goal - self.read(source) if source is not None else np.zeros(goal.size)
+        step = self.step(goal)
+        for _ in range(HELD_STEPS if source is not None else 0):
+            if step.succeeds is not False or self.has_ended:
+                break
+            assert source is not None
+            step = self.step(self.read(source) + away)
+        return step
 
     def read(self, source: Source) -> Numbers:
         """Return the place of the robot by a source, after a step. Shape (size,)."""
@@ -330,7 +347,7 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
         raise NotJudged("reset takes no seed (RL202)")
     places, by_chance = _find_drawn(instance)
     for place in places:
-        copies, turned = _find_copies(instance, place), _find_turned(instance, place)
+        copies, turned = find_copies(instance, place), _find_turned(instance, place)
         if copies or turned:
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
@@ -352,7 +369,7 @@ def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[F
     """Yield the first attribute that the observation shows in a smaller unit."""
     for place in places:
         for factor in SMALLER_UNITS:
-            if copies := _find_copies(instance, place, factor):
+            if copies := find_copies(instance, place, factor):
                 seen = _observe(instance, place, 0.0)[copies[0][0] :][: place.size]
                 yield Fact(SCALED_GOAL, ScaledGoal(place.name, copies[0][0], factor, float(np.linalg.norm(seen))))
                 return
@@ -361,19 +378,35 @@ def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[F
 def _find_drawn(instance: Instance) -> tuple[list[DrawnPlace], list[str]]:
     """Return the places in attributes that a reset draws by its seed and no step changes, and the names of the others
     that it draws."""
+    found = find_drawn(instance, _list_places)
+    candidates = sorted(found.stays, key=lambda name: (found.sizes[name] not in SIZES, name))[:MOST_CANDIDATES]
+    return [place for name in candidates for place in found.stays[name]], found.by_chance
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnPlaces:
+    """What resets draw, by the names of attributes."""
+
+    stays: Mapping[str, Sequence[DrawnPlace]]  # by its seed, and no step changes it
+    by_chance: list[str]  # what else they draw
+    sizes: Mapping[str, int]  # of the attributes that stay
+
+
+def find_drawn(instance: Instance, list_places: Callable[[Attribute, Attribute], list[DrawnPlace]]) -> DrawnPlaces:
+    """Return what resets draw; `list_places` returns the places in an attribute that two resets drew differently."""
     again, *drawn = (_read_after_reset(instance, seed) for seed in (FIRST_SEED, FIRST_SEED, SECOND_SEED))
-    places = {name: _list_places(drawn[0][name], drawn[1][name]) for name in drawn[0].keys() & drawn[1].keys()}
+    places = {name: list_places(drawn[0][name], drawn[1][name]) for name in drawn[0].keys() & drawn[1].keys()}
     names = [name for name, found in places.items() if found]
     seeded = [name for name in names if name in again and np.array_equal(again[name].numbers, drawn[0][name].numbers)]
     by_chance = sorted({*names} - {*seeded})
     if not seeded:
-        return [], by_chance
+        return DrawnPlaces({}, by_chance, {})
     for _ in EpisodePlayer(instance, SECOND_SEED, max_steps=STEPS):
         pass
     after = read_attributes(instance.env)
     stays = [name for name in seeded if name in after and np.array_equal(after[name].numbers, drawn[1][name].numbers)]
-    candidates = sorted(stays, key=lambda name: (drawn[0][name].numbers.size not in SIZES, name))[:MOST_CANDIDATES]
-    return [place for name in candidates for place in places[name]], by_chance
+    sizes = {name: drawn[0][name].numbers.size for name in stays}
+    return DrawnPlaces({name: places[name] for name in stays}, by_chance, sizes)
 
 
 def _read_after_reset(instance: Instance, seed: int) -> dict[str, Attribute]:
@@ -400,7 +433,7 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
     return found
 
 
-def _find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
+def find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
     """Return where the observation has the place, or its difference to something, times a factor; and the sign."""
     before, plain, shifted = (_observe(instance, place, shift) for shift in (0.0, 0.0, 1.0))
     if before.shape != plain.shape or plain.shape != shifted.shape:

@@ -4,6 +4,7 @@ Nothing but its heading is another one then: on level ground the robot moves as 
 """
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
@@ -47,14 +48,23 @@ class TurnedRobot:
 
     instance: Instance
 
-    def play(self, number: int, angle: float, speed: float = 0.0, lift: float = 0.0) -> TurnedStep | None:
+    @functools.cached_property
+    def has_joints(self) -> bool:
+        """Whether the robot moves by joints, which turn with it; a force may be in the world's axes."""
+        if (simulation := find_mujoco(self.instance.env)) is not None:
+            return bool((simulation[0].jnt_type != FREE).any())
+        return any(body.is_free and body.joints for c in self.instance.find_clients() for body in read_world(c).bodies)
+
+    def play(
+        self, number: int, angle: float, speed: float = 0.0, lift: float = 0.0, spin: float = 0.0
+    ) -> TurnedStep | None:
         """Reset with a seed, turn the robot by an angle [rad] about the vertical, lift it [m], let it move forwards at
-        a speed [m/s], and take a step; None where time is over."""
+        a speed [m/s] and roll at a rate [rad/s], and take a step; None where time is over."""
         if self.instance.context.budget.is_over():
             return None
         player = EpisodePlayer(self.instance, FIRST_SEED + number, "zero", max_steps=1)
         player.reset()
-        heading = _turn(self.instance, angle, speed, lift)
+        heading = _turn(self.instance, angle, speed, lift, spin)
         moment = player.step()
         observed = flatten_floats(self.instance.leaves, moment.observation)
         numbers = find_numbers(moment.info) if isinstance(moment.info, dict) else ()
@@ -122,10 +132,10 @@ def _is_level_plane(p: ClientCalls, body: int) -> bool:
     return bool(high[0] - low[0] > ENDLESS and rotate(orientation, UP)[2] > 1 - 1e-9)
 
 
-def _turn(instance: Instance, angle: float, speed: float, lift: float) -> float:
-    """Turn the free robot about the vertical, lift it, and set its velocity; return its heading [rad]."""
+def _turn(instance: Instance, angle: float, speed: float, lift: float, spin: float) -> float:
+    """Turn the free robot about the vertical, lift it, and change its velocities; return its heading [rad]."""
     if (simulation := find_mujoco(instance.env)) is not None:
-        return _turn_in_mujoco(*simulation, angle, speed, lift)
+        return _turn_in_mujoco(*simulation, angle, speed, lift, spin)
     (p, body), *_ = _find_free_bodies(instance.find_clients())
     place, orientation = p.getBasePositionAndOrientation(body)
     linear, angular = p.getBaseVelocity(body)
@@ -133,12 +143,13 @@ def _turn(instance: Instance, angle: float, speed: float, lift: float) -> float:
     turned = multiply(turn, np.array(orientation))
     heading = roll_pitch_yaw(turned.tolist())[2]
     p.resetBasePositionAndOrientation(body, (*place[:2], place[2] + lift), turned.tolist())
-    velocity = rotate(turn, linear) + speed * np.array([np.cos(heading), np.sin(heading), 0.0])
-    p.resetBaseVelocity(body, velocity.tolist(), rotate(turn, angular).tolist())
+    forwards = np.array([np.cos(heading), np.sin(heading), 0.0])
+    velocity, rate = rotate(turn, linear) + speed * forwards, rotate(turn, angular) + spin * forwards
+    p.resetBaseVelocity(body, velocity.tolist(), rate.tolist())
     return float(heading)
 
 
-def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float, lift: float) -> float:
+def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float, lift: float, spin: float) -> float:
     (joint,) = np.flatnonzero(model.jnt_type == FREE)
     place, first = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
     turn = from_axis(UP, angle)
@@ -148,5 +159,6 @@ def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float, lift: flo
     data.qpos[place + 2] += lift
     data.qvel[first : first + 3] = rotate(turn, data.qvel[first : first + 3])
     data.qvel[first : first + 2] += speed * np.array([np.cos(heading), np.sin(heading)])
+    data.qvel[first + 3] += spin  # in the frame of the body
     sys.modules["mujoco"].mj_forward(model, data)
     return float(heading)

@@ -53,7 +53,13 @@ Match = tuple[int, Link, str, int, int]
 
 @judges_worlds(RULE)
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
+    found = False
     for one in watched.observed:
+        for finding in _find_misread_quaternions(one.world, one.logs, one.observed):
+            found = True
+            yield finding
+    # The yaw of an object that lies on something may be constant, where it is read in a wrong order.
+    for one in watched.thrown if not found else ():
         yield from _find_misread_quaternions(one.world, one.logs, one.observed)
 
 

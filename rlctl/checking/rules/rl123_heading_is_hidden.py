@@ -7,21 +7,23 @@ import numpy as np
 
 from rlctl.checking.experiments.turned import TurnedRobot, TurnedStep, judges_turned
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
+from rlctl.checking.transitions import name_floats
 
 RULE = Rule(
     "RL123",
     "heading is hidden",
     Severity.WARNING,
     meaning="""
-        The check turned the robot about the vertical at the start, and let it move forwards. The observation is the
-        same whatever its heading is, and the reward is another one. A policy cannot know in which direction it is
-        paid for moving. An info where all episodes begin with nearly the same heading: then the policy only loses
-        its way as it drifts.
+        The check turned the robot about the vertical at the start, and let it move forwards. The observation is
+        the same whatever its heading is, and the reward is another one: a policy cannot know in which direction
+        it is paid for moving. Or all of the observation is the same but a velocity in the axes of the world,
+        which says nothing to a robot with joints that does not know its heading. An info where all episodes
+        begin with nearly the same heading: then the policy only loses its way as it drifts.
     """,
     fix="""
-        Observe the heading (its cosine and sine, or the way to the goal in the frame of the robot), or reward the
-        velocity in the frame of the robot.
+        Observe the heading (its cosine and sine, or the way to the goal in the frame of the robot), or reward and
+        observe the velocity in the frame of the robot.
     """,
 )
 
@@ -36,6 +38,9 @@ MATTERS, NOTHING = 0.25, 0.01  # parts of what the direction of the movement cha
 MATTERS_STANDING = 0.5
 TINY = 1e-4  # what moving changes in a reward that does not depend on it
 STARTS, VARIED = 6, 0.5  # resets, and how far their headings are apart [rad]
+SPEED, LIFT, SPIN = 0.5, 0.1, 0.5  # [m/s], [m], [rad/s]
+TURN_ERROR, RESTING = 0.1, 0.3  # parts of the length of a velocity
+MOST_TURNED = 24  # elements
 Pair = tuple[TurnedStep, TurnedStep]
 
 
@@ -65,9 +70,52 @@ def _find_hidden_heading(robot: TurnedRobot) -> Iterator[RuleFinding]:
         yield _hidden(robot, *max(shown, key=lambda one: _compare(one[0])))
 
 
+@judges_turned(RULE, place=1)
+def _find_world_velocity(robot: TurnedRobot) -> Iterator[RuleFinding]:
+    """Yield a finding where velocities in the axes of the world are all of the observation that turns with the
+    robot."""
+    if not robot.has_joints:
+        return
+    found: list[set[int]] = []
+    for number in range(CONFIRMED):
+        columns = _find_world_vectors(robot, number)
+        if not columns:
+            return
+        found.append(columns)
+    columns = set.intersection(*found)
+    if not columns:
+        return
+    names = name_floats(robot.instance.leaves)
+    listed = list_names([names[column] for column in sorted(columns)])
+    message = f"{listed} are a velocity in the axes of the world, and nothing of the observation shows the heading of"
+    message += " the robot: turned about the vertical, and moving in the same way, it observes the same otherwise"
+    evidence = {"element": names[min(columns)], "seed": FIRST_SEED}
+    yield RuleFinding(RULE, message, evidence, _judge_starts(robot))
+
+
+def _find_world_vectors(robot: TurnedRobot, number: int) -> set[int]:
+    """Return the elements that turn with the robot as a velocity in the axes of the world; none where others change
+    too."""
+    steps = [robot.play(number, angle, SPEED, LIFT, SPIN) for angle in ANGLES]
+    resting = robot.play(number, ANGLES[0], 0.0, LIFT)
+    if resting is None or any(step is None for step in steps):
+        return set()
+    rows = np.array([step.observed for step in steps if step is not None])
+    allowed = SAME * np.maximum(1.0, np.abs(rows[0]))
+    changes = np.flatnonzero((np.abs(rows - rows[0]) > allowed).any(axis=0)).tolist()
+    turned: set[int] = set()
+    for column in changes[:MOST_TURNED]:
+        if column + 1 >= rows.shape[1]:
+            continue
+        block = rows[:, column] + 1j * rows[:, column + 1]
+        error = np.abs(block * np.exp(-1j * np.array(ANGLES)) - block[0]).max()
+        at_rest = np.hypot(*resting.observed[column : column + 2])
+        if error < TURN_ERROR * abs(block[0]) and at_rest < RESTING * abs(block[0]):
+            turned |= {column, column + 1}
+    return turned if set(changes) <= turned else set()
+
+
 def _hidden(robot: TurnedRobot, pair: tuple[TurnedStep, TurnedStep], speed: float) -> RuleFinding:
-    starts = [robot.play(number, 0.0) for number in range(STARTS)]
-    severity = Severity.WARNING if _is_varied([start for start in starts if start is not None]) else Severity.INFO
     low, high = sorted(step.reward for step in pair)
     what = f"turned about the vertical, the robot observes the same and gets rewards from {low:.4g} to {high:.4g}"
     message = f"{what} for moving forwards at {speed:g} m/s"
@@ -75,7 +123,7 @@ def _hidden(robot: TurnedRobot, pair: tuple[TurnedStep, TurnedStep], speed: floa
     if shared := one.keys() & two.keys():
         term = max(shared, key=lambda name: abs(one[name] - two[name]))
         message += f"; term {term!r} is from {min(one[term], two[term]):.4g} to {max(one[term], two[term]):.4g}"
-    return RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": high - low, "expected": 0.0}, severity)
+    return RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": high - low, "expected": 0.0}, _judge_starts(robot))
 
 
 def _play_angles(robot: TurnedRobot, number: int, speed: float, lift: float) -> tuple[Pair, float] | None:
@@ -115,6 +163,11 @@ def _are_same(one: TurnedStep, two: TurnedStep) -> bool:
         return False
     allowed = SAME * np.maximum(1.0, np.abs(one.observed))
     return bool((np.abs(one.observed - two.observed) <= allowed).all())
+
+
+def _judge_starts(robot: TurnedRobot) -> Severity:
+    starts = [robot.play(number, 0.0) for number in range(STARTS)]
+    return Severity.WARNING if _is_varied([start for start in starts if start is not None]) else Severity.INFO
 
 
 def _is_varied(starts: Sequence[TurnedStep]) -> bool:

@@ -45,7 +45,7 @@ class _Vectors:
 
     name: str
     right: Sequence[Array]
-    wrong: Array
+    wrong: Sequence[Array]
     is_down: bool = False
     """Whether it is gravity: the opposite is an axis of the body, in the world."""
 
@@ -77,7 +77,7 @@ def _list_vectors(frame: BodyFrame) -> Iterator[_Vectors]:
         inside = np.einsum("nji,nj->ni", frame.matrices, vectors)
         outside = np.einsum("nij,nj->ni", frame.matrices, vectors)
         if frame.falls or not is_down:
-            yield _Vectors(name, [vectors, inside], outside, is_down)
+            yield _Vectors(name, [vectors, inside], [outside], is_down)
 
 
 def _list_gravities(one: ObservedWorld) -> Iterator[_Vectors]:
@@ -87,7 +87,7 @@ def _list_gravities(one: ObservedWorld) -> Iterator[_Vectors]:
             quaternions = np.array([poses[body.id, -1][ORIENTATION] for log in one.logs for poses in log.poses])
             down = np.tile([0.0, 0.0, -1.0], (len(quaternions), 1))
             turned = attitudes.rotate(quaternions, down)
-            yield _Vectors(f"gravity, as {body.name} feels it", [down, turned[:, :3]], turned[:, 3:6], True)
+            yield _Vectors(f"gravity, as {body.name} feels it", [down, turned[:, :3]], [turned[:, 3:6]], True)
 
 
 def _list_velocities(one: ObservedWorld) -> Iterator[_Vectors]:
@@ -109,16 +109,18 @@ def _turn(name: str, values: Array, quaternions: Array, *, is_own: bool) -> _Vec
     turned = attitudes.rotate(quaternions, values)
     inside, outside = turned[:, :3], turned[:, 3:6]
     if is_own:
-        return _Vectors(name, [values, outside], inside)
+        return _Vectors(name, [values, outside], [inside])
     level = np.column_stack([turned[:, 6:], values[:, 2]])
-    return _Vectors(name, [values, inside, level], outside)
+    twice = attitudes.rotate(quaternions, inside)[:, :3]
+    return _Vectors(name, [values, inside, level], [outside, twice])
 
 
 def _find_in_observation(observed: Array, vectors: _Vectors) -> Iterator[RuleFinding]:
-    size = vectors.wrong.shape[1]
+    size = vectors.wrong[0].shape[1]
     for column in range(observed.shape[1] - size + 1):
         block = observed[:, column : column + size]
-        if not _fits(block, vectors, vectors.wrong) or any(_fits(block, vectors, right) for right in vectors.right):
+        is_wrong = any(_fits(block, vectors, wrong) for wrong in vectors.wrong)
+        if not is_wrong or any(_fits(block, vectors, right) for right in vectors.right):
             continue
         name = f"observation[{column}:{column + size}]"
         message = f"{name} is {vectors.name}, turned by the orientation the wrong way: in no frame of the robot"

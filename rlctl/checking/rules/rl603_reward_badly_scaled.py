@@ -31,8 +31,7 @@ HUGE = 1_000.0  # a single larger reward spoils the values before it
 
 @judges_records(RULE)
 def _find_badly_scaled(records: Records) -> Iterator[RuleFinding]:
-    require_rewarded(records)
-    episodes = [episode for episode in records.role("episodes") if episode.steps]
+    episodes = [episode for episode in require_rewarded(records) if episode.role == "episodes"]
     if not episodes:
         return
     inner = np.concatenate([episode.rewards[: episode.steps - episode.has_ended] for episode in episodes])

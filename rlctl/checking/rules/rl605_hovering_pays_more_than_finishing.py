@@ -104,7 +104,7 @@ def _measure_income(trials: GoalTrials, source: Source, seed: int) -> Income | N
         return None
     place = arriving.read(source)
     at_goal = GoalEpisode(trials, seed, "zero", FIRST_STEPS)
-    success = at_goal.step(place)
+    success = at_goal.hold(place, source)
     if not success.succeeds or not at_goal.has_ended:
         return None
     for offset in OFFSETS:
@@ -118,7 +118,7 @@ def _measure_income(trials: GoalTrials, source: Source, seed: int) -> Income | N
         # What is paid for a change of the distance is paid once, when the goal is moved.
         late = min(step.reward for step in steps[RESTING_STEPS // 2 :]) if is_still else 0.0
         # A source that is constant is where a robot begins, and not where it is now.
-        if is_still and not resting.step(place).succeeds:
+        if is_still and not resting.hold(place, source).succeeds:
             return None
         return Income(seed, late, distance, success.reward)
     return None

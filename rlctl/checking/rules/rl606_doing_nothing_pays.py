@@ -53,7 +53,8 @@ def _find_paid_idleness(records: Records) -> Iterator[RuleFinding]:
     earned = f"doing nothing earns {mean:.4g} over {steps} steps (discounted by {rewards.DISCOUNT})"
     message = f"{earned}, the best of {len(something)} other episodes {best:.4g}{because}"
     evidence = idle[0].at(steps, value=mean, best=best, term=bonus, share=share)
-    yield RuleFinding(RULE, message, evidence, Severity.WARNING if bonus else Severity.INFO)
+    is_named = any(rewards.has_terms(episode) for episode in records.alone)
+    yield RuleFinding(RULE, message, evidence, Severity.WARNING if bonus and is_named else Severity.INFO)
 
 
 def _bonus(idle: Sequence[CheckedEpisode]) -> tuple[str | None, float]:

@@ -20,7 +20,8 @@ RULE = Rule(
     meaning="""
         compute_reward gives another reward than step did, cannot take many goals at once, or gives the same
         whatever desired_goal it is asked for, as where it reads the environment's own goal. Hindsight experience
-        replay (HER) takes most of its rewards from there, and so learns another task.
+        replay (HER) takes most of its rewards from there, and so learns another task. A warning where it pays more for
+        another desired goal than for the one that is achieved exactly: a part of the error has a wrong sign.
     """,
     fix="""
         Let step() return float(self.compute_reward(achieved_goal, desired_goal, info)), and write
@@ -34,6 +35,12 @@ TOLERANCE = 1e-4  # relative to the reward or to 1: rounding to float32
 GOALS = ("achieved_goal", "desired_goal")
 LEAST = 1e-9  # differences of rewards that count, relative to the reward or to 1
 RESETS = 6  # that draw other goals to ask for
+MOSTLY = 0.6  # part of the achieved goals that have to earn less than others
+CLEARLY, UNIT = 0.02, 1e-4  # part of the rewards' range; how far from 1 the length of a direction may be
+SIGNS = """
+    Let reward be largest where achieved_goal is desired_goal: compare each element with its own, as in the cosine of
+    an angle's error, which is cos(a) * cos(b) + sin(a) * sin(b).
+"""
 Rows = NDArray[Any]
 
 
@@ -76,7 +83,8 @@ def recompute_rewards(context: Context) -> Iterator[ChildMessage]:
         evidence = {"step": step + 1, "value": float(computed[step]), "expected": float(rewards[step])}
         yield RuleFinding(RULE, message, evidence)
     else:
-        yield from _find_ignored_goal(instance, ask, goals[0], infos)
+        ignored = list(_find_ignored_goal(instance, ask, goals[0], infos))
+        yield from ignored or _find_better_goals(instance, ask, goals[0], infos)
 
 
 def _ask(instance: Instance, compute: Callable[..., Any], achieved: Rows, desired: Rows, infos: Rows) -> Rows:
@@ -106,8 +114,49 @@ def _find_ignored_goal(
     yield RuleFinding(RULE, message, {"element": "desired_goal", "step": row + 1, "value": float(rewards[0])})
 
 
-def _draw_goals(instance: Instance) -> Rows:
-    """Return the goals that other seeds draw. Shape (RESETS, *goal)."""
+def _find_better_goals(instance: Instance, ask: Callable[..., Rows], last: Rows, infos: Rows) -> Iterator[RuleFinding]:
+    """Ask for the rewards of achieved goals where just they are desired, and where a part of the desired goal is
+    another one: of the first ones of some episodes, and of the last one of the steps that were taken."""
+    if last.ndim != 2 or last.dtype.kind != "f":
+        return
+    achieved, drawn = np.vstack([_draw_goals(instance, "achieved_goal"), last[-1:]]), _draw_goals(instance)
+    beaten: list[tuple[float, float, Rows, Rows]] = []
+    for goal in achieved:
+        others = np.array(list(_mix(goal, drawn)))
+        desired = np.vstack([goal, others])
+        own, *rewards = ask(np.array([goal] * len(desired)), desired, infos[[0] * len(desired)]).tolist()
+        best = int(np.argmax(rewards))
+        if rewards[best] > own + CLEARLY * max(LEAST, float(np.ptp([own, *rewards]))):
+            beaten.append((own, rewards[best], goal, others[best]))
+    if len(beaten) >= MOSTLY * len(achieved):
+        own, best_reward, goal, other = max(beaten, key=lambda one: one[1] - one[0])
+        texts = [np.round(numbers, 3).tolist() for numbers in (goal, other)]
+        message = f"compute_reward returns {own:.4g} where achieved_goal {texts[0]} is just what is desired, and"
+        message += f" {best_reward:.4g} where {texts[1]} is; so it is with {len(beaten)} of {len(achieved)} goals"
+        evidence = {"element": "desired_goal", "value": own, "expected": f"at least {best_reward:.6g}"}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, " ".join(SIGNS.split()))
+
+
+def _mix(goal: Rows, drawn: Rows) -> Iterator[Rows]:
+    """Yield other goals, and those of which the first or the last elements are other ones; without what breaks a
+    direction that all goals have, whose length is 1."""
+    every = np.vstack([goal, drawn])
+    units = [
+        slice(first, first + size)
+        for size in (2, 3, 4)
+        for first in range(goal.size - size + 1)
+        if np.abs(np.linalg.norm(every[:, first : first + size], axis=1) - 1).max() < UNIT
+    ]
+    for other in drawn:
+        for cut in range(goal.size):
+            for one, two in ((goal, other), (other, goal)):
+                mixed = np.concatenate([one[:cut], two[cut:]])
+                if all(abs(np.linalg.norm(mixed[unit]) - 1) < UNIT for unit in units):
+                    yield mixed
+
+
+def _draw_goals(instance: Instance, name: str = "desired_goal") -> Rows:
+    """Return the goals that other seeds draw, or what is achieved then. Shape (RESETS, *goal)."""
     seeds = range(FIRST_SEED + 1, FIRST_SEED + 1 + RESETS)
     starts = [EpisodePlayer(instance, seed, max_steps=0).reset() for seed in seeds]
-    return np.stack([np.asarray(start.observation["desired_goal"]) for start in starts])
+    return np.stack([np.asarray(start.observation[name]) for start in starts])

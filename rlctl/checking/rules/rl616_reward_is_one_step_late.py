@@ -50,6 +50,8 @@ def _find_late_reward(records: Records) -> Iterator[RuleFinding]:
         steps = collect_transitions(records)
         fit = _fit_before(sample_ordinary_steps(steps))
         is_certain |= first["reward"] > first["observation"] and any(find_rates(steps))
+    # All of the state has answered by the first step: then nothing was left for the second one but the reward.
+    is_certain |= first.get("state") == first["observation"] > 0
     if fit is not None:
         of = f" ({', '.join(fit.picked)})" if fit.picked else ""
         exact = f"to within {max(fit.error, 1e-9):.0e} of its spread"

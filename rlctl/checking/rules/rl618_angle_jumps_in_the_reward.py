@@ -1,13 +1,15 @@
 """RL618: angle jumps in the reward."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking import rewards
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, Source, judges_goals
 from rlctl.checking.experiments.turned import TurnedRobot, judges_turned
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
@@ -21,7 +23,7 @@ RULE = Rule(
         The reward jumps in the steps in which an observed angle passes from pi to -pi, and hardly ever else.
         The robot itself moves on smoothly there: the reward uses a difference of two angles that is not
         wrapped, so an error of 0.1 rad counts as one of 6.2, and turning the short way is punished. Robots with a
-        free base are also turned by the check, all around the vertical.
+        free base are also turned by the check, all around the vertical, and goals are moved around the robot.
     """,
     fix="Wrap the difference, (a - b + pi) % (2 * pi) - pi, or use 1 - cos(a - b).",
 )
@@ -39,16 +41,21 @@ _SHIFTS = [shift for shift in range(-NEIGHBOURS, NEIGHBOURS + 1) if shift]
 
 
 TURNS, HALVINGS = 12, 10  # headings all around, and how often the interval of the largest change is halved
-TURNED_SEEDS = 2
+TURNED_SEEDS, MOST_SEEDS, MOST_STEADY = 2, 4, 1
+"""Starts that have to show it; and of a goal, that are tried, and that may not: with the heading 0 nothing jumps."""
+DIRECTIONS, CLEARLY = 24, 3.0  # of a goal, and how much more the reward has to change at pi than between any others
+DISTANCE = 0.5  # part of the goals' range, at which a goal is moved around the robot
 LARGE_JUMP = 0.5  # part of that change which is left then: of a smooth function it is a thousandth
 NEAR_PI = 0.01  # of where it is [rad]
 
+MOST_DIRECTIONS, ALL_AROUND = 24, 8  # pairs that are tried; eighths of a turn in which a direction has to be
 
-@judges_records(RULE, *rewards.WITH_SEARCH, "turned")
+
+@judges_records(RULE, *rewards.WITH_SEARCH, "turned", "goals")
 def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     steps = collect_transitions(records)
-    passes, pairs = _find_passes(steps), find_unit_pairs(steps.before)
+    passes, pairs = _find_passes(steps), _find_directions(steps)
     if not passes and not pairs:
         if records.finished.get("turned") is not None and "turned" not in records.not_applicable:
             return
@@ -64,7 +71,8 @@ def _turn_around(robot: TurnedRobot) -> Iterator[RuleFinding]:
     """Yield a finding where the reward jumps at the heading pi, from whatever start."""
     sizes: list[float] = []
     for number in range(TURNED_SEEDS):
-        jump = _find_jump(robot, number)
+        start = robot.play(number, 0.0)
+        jump = None if start is None else _find_jump(functools.partial(_pay_turned, robot, number, start.heading))
         if jump is None:
             return
         sizes.append(jump)
@@ -72,21 +80,63 @@ def _turn_around(robot: TurnedRobot) -> Iterator[RuleFinding]:
     yield RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": sizes[0], "expected": "no jump"})
 
 
-def _find_jump(robot: TurnedRobot, number: int) -> float | None:
-    """Return how much the reward jumps at the heading pi; None if it is steady there, or jumps more elsewhere."""
-    start = robot.play(number, 0.0)
-    if start is None:
-        return None
+def _pay_turned(robot: TurnedRobot, number: int, start: float, heading: float) -> float:
+    step = robot.play(number, heading - start)
+    return np.nan if step is None else step.reward
 
-    def pay(heading: float) -> float:
-        step = robot.play(number, heading - start.heading)
-        return np.nan if step is None else step.reward
 
+@judges_goals(RULE, decides=False, place=2)
+def _move_goal_around(trials: GoalTrials) -> Iterator[RuleFinding]:
+    """Yield a finding where the reward jumps with the goal in the direction pi from the robot, whatever its heading."""
+    sources = [trials.at_goal.source, *trials.drawn.turned, *trials.drawn.copies]
+    source = next((one for one in sources if one is not None), None)
+    if source is None or trials.drawn.place.size < 2:
+        return
+    sizes: list[float] = []
+    for number in range(MOST_SEEDS):
+        if number - len(sizes) > MOST_STEADY:
+            return
+        seed = FIRST_SEED + number
+        episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
+        jump = None if episode.has_ended else _find_goal_jump(trials, source, seed)
+        sizes += [] if jump is None else [jump]
+        if len(sizes) == TURNED_SEEDS or trials.instance.context.budget.is_over():
+            break
+    if len(sizes) < TURNED_SEEDS:
+        return
+    message = (
+        f"the reward jumps by {sizes[0]:.3g} where the direction of {trials.drawn.name} from the robot passes from"
+    )
+    evidence = {"element": trials.drawn.name, "seed": FIRST_SEED, "value": sizes[0], "expected": "no jump"}
+    yield RuleFinding(RULE, f"{message} pi to -pi", evidence)
+
+
+def _pay_goal(trials: GoalTrials, source: Source, seed: int, direction: float) -> float:
+    """Return what a step pays with the goal in a direction from the robot [rad]."""
+    episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
+    away = np.zeros(trials.drawn.place.size)
+    away[:2] = DISTANCE * trials.range[:2].max() * np.array([np.cos(direction), np.sin(direction)])
+    goal = episode.read(source) + away
+    steps = episode.play([goal, goal])  # the first may pay the way of the goal as progress
+    return steps[-1].reward if len(steps) == 2 else np.nan
+
+
+def _find_goal_jump(trials: GoalTrials, source: Source, seed: int) -> float | None:
+    """Return how much the reward jumps with the goal in the direction pi; None if it changes as much elsewhere."""
+    width = 2 * np.pi / DIRECTIONS
+    directions = np.pi + width * (np.arange(DIRECTIONS) + 0.5)
+    paid = np.array([_pay_goal(trials, source, seed, float(direction)) for direction in directions])
+    jump = float(abs(paid[0] - paid[-1]))
+    return jump if jump > CLEARLY * np.abs(np.diff(paid)).max() else None
+
+
+def _find_jump(pay: Callable[[float], float]) -> float | None:
+    """Return how much the reward jumps at the angle pi; None if it is steady there, or jumps more elsewhere."""
     low, high = np.pi - np.pi / TURNS, np.pi + np.pi / TURNS
-    around = np.array([pay(heading) for heading in np.linspace(high, low + 2 * np.pi, TURNS)])
+    around = np.array([pay(angle) for angle in np.linspace(high, low + 2 * np.pi, TURNS)])
     first, last = float(around[-1]), float(around[0])  # at `low` and at `high`
     whole = abs(last - first)
-    if not whole > np.nanmax(np.abs(np.diff(around))):
+    if not whole > np.nanmax(np.abs(np.diff(around)), initial=0.0):
         return None
     for _ in range(HALVINGS):
         middle = (low + high) / 2
@@ -130,7 +180,8 @@ def _judge_passes(
 
 def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> tuple[float, str] | None:
     """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
-    times pi - |e|, where only the cosine and the sine of e are observed. None if it does not."""
+    times pi - |e|, where its cosine and sine are observed, or a
+    vector in its direction. None if it does not."""
     for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
         room = np.pi - np.abs(_angle(steps.after, cosine, sine))
         rows = jumps.is_jump & (room > LEAST_ROOM)
@@ -146,6 +197,17 @@ def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _
             where = f"in {int(rows.sum())} steps in which the angle e of {name} changes little"
             return factor, f"times pi - |e| {where}, as if e were e + 2 pi there"
     return None
+
+
+def _find_directions(steps: Transitions) -> list[tuple[int, int]]:
+    """Return the cosines and sines of angles, and pairs of consecutive elements that point in all directions, such as
+    the way to a goal in the frame of the robot."""
+    pairs = find_unit_pairs(steps.before)
+    for column in range(min(len(steps.names) - 1, MOST_DIRECTIONS)):
+        angles = _angle(steps.before, column, column + 1)
+        if (column, column + 1) not in pairs and len(np.unique(np.round(angles / (np.pi / 4)))) >= ALL_AROUND:
+            pairs.append((column, column + 1))
+    return pairs
 
 
 def _find_passes(steps: Transitions) -> dict[str, NDArray[np.bool_]]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.attributes import WEIGHED_TERMS
+from rlctl.checking.experiments.attributes import ACTION_TERMS, WEIGHED_TERMS
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     ENOUGH_STEPS,
@@ -16,17 +16,18 @@ from rlctl.checking.rewards import (
     summarize,
 )
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
-from rlctl.checking.term_names import ENERGY_WORDS, is_about_actions
+from rlctl.checking.term_names import CHANGE_WORDS, ENERGY_WORDS, is_about_actions
 
 RULE = Rule(
     "RL620",
     "cost that is always zero",
     Severity.WARNING,
     meaning="""
-        A reward term that is named after the actions, their change, or the effort of the motors is exactly 0 at
-        every recorded step, although the actions changed. It costs nothing, so nothing keeps the motions smooth or
-        cheap. Terms whose name says that only a part counts, such as excess_torque, are not judged. An info in a
-        plain environment, unless its source multiplies the term by a known number other than 0.
+        A reward term that is named after the actions, their change, or the effort of the motors, or that its
+        source computes from the action without a limit, is exactly 0 at every recorded step, although the
+        actions changed. It costs nothing, so nothing keeps the motions smooth or cheap. Terms whose name says
+        that only a part counts, such as excess_torque, are not judged. An info in a plain environment, unless
+        its source multiplies the term by a known number other than 0.
     """,
     fix="""
         Look at what the term is computed from. An action must not be compared with itself: keep a copy of the last
@@ -42,10 +43,12 @@ def _find_zero_costs(records: Records) -> Iterator[RuleFinding]:
         raise NotJudged(f"the actions changed in fewer than {ENOUGH_STEPS} steps")
     raw_terms = join_terms(episodes, RAW_TERMS)
     weighed: dict[str, tuple[str, int]] = records.facts.get(WEIGHED_TERMS, {})
+    of_actions: set[str] = records.facts.get(ACTION_TERMS, set())
     for name, values in join_terms(episodes).items():
         raw = raw_terms.get(name)
         is_weightless = raw is not None and raw.any()
-        if not values.any() and not is_weightless and is_about_actions(name, ENERGY_WORDS):
+        is_action_cost = is_about_actions(name, ENERGY_WORDS | CHANGE_WORDS) or name in of_actions
+        if not values.any() and not is_weightless and is_action_cost:
             message = f"reward term {name!r} is 0 at every step of {summarize(episodes)}"
             severity = Severity.INFO
             if raw is not None:

@@ -25,10 +25,11 @@ RULE = Rule(
     "penalty that pays",
     Severity.WARNING,
     meaning="""
-        A reward term that should lower the reward raises it: its weight is negative and the term too, or it has no
-        minus. The policy learns to seek what the term should prevent. Judged are terms of a task with a negative
-        weight that are named after an error or a cost; costs of actions that pay more for moving than for doing
-        nothing; and, as an info, terms that are called cost or penalty.
+        A reward term that should lower the reward raises it: its weight is negative and the term too, or it has
+        no minus; weights that info does not have are estimated from the rewards. The policy learns to seek what
+        the term should prevent. Judged are terms of a task with a negative weight that are named after an error
+        or a cost; costs of actions that pay more for moving than for doing nothing; and, as an info, terms that
+        are called cost or penalty.
     """,
     fix="Return the term without a sign, such as a distance or a squared action, and put the sign in the weight.",
 )

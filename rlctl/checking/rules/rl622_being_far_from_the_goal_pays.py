@@ -68,10 +68,12 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     if not reports_success:
         yield Skipped(RULE.id, "no success is reported", applies=False)
         return
+    is_held = source is None  # whether a success takes longer than the steps that are compared
+    source = trials.at_goal.source if source is None else source
     if source is None:
         yield Skipped(RULE.id, "no goal next to the robot was a success")
         return
-    insides = _find_insides(trials, source)
+    insides = _find_insides(trials, source, is_held)
     if len(insides) < EPISODES:
         yield Skipped(RULE.id, _explain_few(len(insides)))
         return
@@ -96,12 +98,13 @@ def _explain_few(count: int) -> str:
     )
 
 
-def _find_insides(trials: GoalTrials, source: Source) -> dict[int, _Outcome]:
-    """Return what a goal gives that is where the robot is, by episode; of those in which it is a success."""
+def _find_insides(trials: GoalTrials, source: Source, is_held: bool) -> dict[int, _Outcome]:
+    """Return what a goal gives that is where the robot is, by episode; of those in which it is a success, at once or
+    later."""
     insides: dict[int, _Outcome] = {}
     for number in range(MOST_EPISODES):
         inside = _measure(trials, source, number, np.zeros((LATER_STEPS, trials.goals.shape[1])))
-        if inside is not None and inside.succeeds:
+        if inside is not None and (inside.succeeds or is_held):
             insides[number] = inside
         if len(insides) == EPISODES:
             break

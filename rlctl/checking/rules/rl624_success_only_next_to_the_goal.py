@@ -48,7 +48,7 @@ def _is_narrow(trials: GoalTrials, source: Source, seed: int, away: float) -> bo
     """Say whether a goal is a success where the robot is, and none at a distance to each side of it."""
     place = trials.find_place(source, seed)
     if place is None or not trials.succeeds(seed, place):
-        return False
+        return False  # also where a goal has to be held, while the robot moves
     return all(trials.succeeds(seed, goal) is False for goal in _surround(place, away))
 
 

@@ -10,7 +10,7 @@ from rlctl.checking.experiments.attributes import EPISODES, AttributeLog
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import find_rates
-from rlctl.checking.term_names import is_about_steps, is_paid
+from rlctl.checking.term_names import is_about_landings, is_about_steps, is_paid
 
 RULE = Rule(
     "RL628",
@@ -50,12 +50,15 @@ def _find_paid_standing(records: Records) -> Iterator[RuleFinding]:
     for name, values in terms.items():
         paid = np.array([values[rows].mean() for rows in looks])
         most = float(np.nanquantile(values, MOST_PAID))
+        shown = f"{paid.mean():.3g} in each step while nothing moves"
         if paid.min() > MUCH * most > 0:
-            message = f"{name} pays {paid.mean():.3g} in each step while nothing moves, {paid.mean() / most:.0%} of the"
-            message += (
-                f" {most:.3g} that it pays at most, in {len(looks)} of {len(looks)} episodes with the zero action"
-            )
-            yield RuleFinding(RULE, message, {"term": name, "value": float(paid.mean()), "expected": 0.0})
+            message = f"{name} pays {shown}, {paid.mean() / most:.0%} of the {most:.3g} that it pays at most"
+        elif is_about_landings(name) and paid.max() < MUCH * float(np.nanquantile(values, 1 - MOST_PAID)) < 0:
+            message = f"{name} is {shown}: feet that stay on the ground count as feet that come down in each step"
+        else:
+            continue
+        message += f", in {len(looks)} of {len(looks)} episodes with the zero action"
+        yield RuleFinding(RULE, message, {"term": name, "value": float(paid.mean()), "expected": 0.0})
 
 
 def _find_still(log: AttributeLog) -> NDArray[np.bool_]:

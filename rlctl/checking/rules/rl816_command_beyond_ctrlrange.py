@@ -16,6 +16,7 @@ from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.rules.rl810_joint_target_in_degrees import find_ranges_in_degrees, find_targets_in_degrees
 from rlctl.checking.rules.rl811_joint_targets_in_another_order import find_other_orders
+from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array, Joint, JointActuator
 
 RULE = Rule(
@@ -26,7 +27,8 @@ RULE = Rule(
         Actions of the space give an actuator of MuJoCo more than its ctrlrange, to which MuJoCo clamps it
         silently. Different actions then do the same, and exploration at the ends of the range is lost. So it is
         with a command that each action changes and nothing clips, also in PyBullet, where a target leaves the
-        limits of its joint: when the action turns round, nothing happens until the command is back.
+        limits of its joint: when the action turns round, nothing happens until the command is back. And so it is
+        with a position that most actions put beyond the limits of its joint, which then stays at its stop.
     """,
     fix="""
         Scale the action to the actuator's range, low + (action + 1) / 2 * (high - low), from
@@ -35,6 +37,8 @@ RULE = Rule(
     shows_one=True,
 )
 
+OUTSIDE, FEWEST_TARGETS = 0.75, 30  # part of the targets that a joint cannot reach, and how many are looked at
+TURN = "Turn its sign, or shift it: the target has to lie between the joint's limits, in the direction of its own axis."
 BulletJoint = tuple[int, int, int]
 """Client, body and joint."""
 LONGEST_HOLD, TURNED = 200, 30  # steps of one action, and then of its opposite
@@ -51,7 +55,7 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for world, spans in watched.driven:
         in_degrees = find_targets_in_degrees(world, watched.calls) or list(find_ranges_in_degrees(spans))
         if not in_degrees and not find_other_orders(world, spans):
-            yield from _find_clamped(spans)
+            yield from list(_find_clamped(spans)) or _find_outside(world)
 
 
 @judges_trials(RULE, place=50)
@@ -211,3 +215,23 @@ def _find_clamped(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:
         message = f"{what}; {range_}: only {100 * inside:.0f} % of the action's range has an effect of its own{more}"
         evidence = {"element": f"action[{span.element}]", "value": [span.low, span.high]}
         yield RuleFinding(RULE, message, {**evidence, "expected": [span.motor.low, span.motor.high]})
+
+
+def _find_outside(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield a joint that most random actions give a target beyond its limits."""
+    logs = [log for log in world.logs if log.actions == "random"]
+    for body in world.world.bodies:
+        for joint in body.joints:
+            given = [targets.get((body.id, joint.index)) for log in logs for targets in log.targets[1:]]
+            values = np.array([target.value for target in given if target is not None])
+            if not joint.has_limits or len(values) < FEWEST_TARGETS or np.ptp(values) == 0:
+                continue
+            outside = float(((values < joint.low) | (values > joint.high)).mean())
+            if outside > OUTSIDE:
+                low, high = float(values.min()), float(values.max())
+                message = f"random actions set the target of joint {joint.name} to [{low:.4g}, {high:.4g}]; its limits"
+                message += f" are [{joint.low:.4g}, {joint.high:.4g}]: it is told to go beyond them in"
+                message += f" {100 * outside:.0f} % of the steps, and stays at its stop"
+                evidence = {"element": joint.name, "value": [low, high], "expected": [joint.low, joint.high]}
+                yield RuleFinding(RULE, message, evidence, fix=TURN)
+                return

@@ -2,11 +2,10 @@
 
 import collections
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
-from rlctl.checking.contact_trials import PlayedContacts, play_in_bullet, play_in_mujoco
+from rlctl.checking.contact_trials import PlayedContacts, make_contacts, play_in_bullet, play_in_mujoco
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.instance import EnvironmentRaised
 from rlctl.checking.mujoco_worlds import MujocoStateReader
@@ -167,20 +166,10 @@ def _play_in_bullet(
         links = [((contact[1], contact[3]), (contact[2], contact[4])) for contact in contacts]
         pairs = zip(contacts, links, strict=True)
         shown = [contact for contact, pair in pairs if pair in kept or pair[::-1] in kept]
-        shown += _make_contacts(asked, bump) if bump is not None else ()
+        shown += make_contacts(asked, bump) if bump is not None else ()
         return tuple(shown)
 
     return play_in_bullet(watched, world, change)
-
-
-def _make_contacts(asked: Sequence[int | None], bump: tuple[Link, Link]) -> Iterator[tuple[Any, ...]]:
-    """Yield a contact as getContactPoints returns it, if it has the bodies and links that are asked for."""
-    nothing = (0.0, 0.0, 0.0)
-    for one, two in (bump, bump[::-1]):
-        given = (one[0], two[0], one[1], two[1])
-        if all(wanted in (None, value) for wanted, value in zip(asked, given, strict=False)):
-            yield (0, *given, nothing, nothing, (0.0, 0.0, 1.0), -1e-3, 10.0, 0.0, nothing, 0.0, nothing)
-            return
 
 
 def _play_in_mujoco(

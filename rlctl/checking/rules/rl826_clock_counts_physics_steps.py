@@ -160,10 +160,10 @@ def _is_turn(advance: float, turns: float, whole: float) -> bool:
 def _list_periods(declared: Mapping[str, float]) -> Iterator[tuple[str, float]]:
     for name, value in declared.items():
         words = set(words_of(name))
-        if value > 0 and words & PERIOD_WORDS and not words & STEP_WORDS:
-            yield name, value
-        elif value > 0 and words & FREQUENCY_WORDS:
+        if value > 0 and words & FREQUENCY_WORDS:  # first: gait_hz is no period
             yield name, 1 / value
+        elif value > 0 and words & PERIOD_WORDS and not words & STEP_WORDS:
+            yield name, value
 
 
 def _name_wrong(seconds: float, times: StepTimes) -> str:

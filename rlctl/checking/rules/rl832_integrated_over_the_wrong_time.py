@@ -9,7 +9,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
-from rlctl.checking.step_times import find_declared, find_rates
+from rlctl.checking.step_times import NamedRate, find_declared, list_named_rates
 
 RULE = Rule(
     "RL832",
@@ -35,25 +35,20 @@ def _find_wrong_integration(records: Records) -> Iterator[RuleFinding]:
     declared = find_declared(log)
     if declared is None:
         raise NotApplicable("no step has several substeps, as far as it is known")
-    rates = find_rates(log, log.values)
+    rates = list_named_rates(log)
     for name, declared_s in declared.times.items():
         for control_s in (declared_s, declared_s * declared.substeps):
-            right = [pair for pair in rates if math.isclose(pair[2], control_s, rel_tol=NEAR)]
+            right = [pair for pair in rates if math.isclose(pair.seconds, control_s, rel_tol=NEAR)]
             for factor in (declared.substeps, 1 / declared.substeps) if right else ():
-                wrong = [pair for pair in rates if math.isclose(pair[2], factor * control_s, rel_tol=NEAR)]
+                wrong = [pair for pair in rates if math.isclose(pair.seconds, factor * control_s, rel_tol=NEAR)]
                 if wrong and len(wrong) <= len(right):
                     yield _describe(
-                        log, wrong[0], right[0], f"{name} is {declared_s:.3g} s, {declared.count} {declared.substeps}"
+                        wrong[0], right[0], f"{name} is {declared_s:.3g} s, {declared.count} {declared.substeps}"
                     )
                     return
 
 
-def _describe(
-    log: AttributeLog, wrong: tuple[int, int, float], right: tuple[int, int, float], declared: str
-) -> RuleFinding:
-    one, two = (
-        f"{log.names[column]} changes by {log.names[rate]} times {seconds:.3g} s"
-        for column, rate, seconds in (wrong, right)
-    )
+def _describe(wrong: NamedRate, right: NamedRate, declared: str) -> RuleFinding:
+    one, two = (f"{each.name} changes by {each.rate} times {each.seconds:.3g} s" for each in (wrong, right))
     message = f"in a step {one}, and {two}: {declared}"
-    return RuleFinding(RULE, message, {"element": log.names[wrong[0]], "value": wrong[2], "expected": right[2]})
+    return RuleFinding(RULE, message, {"element": wrong.name, "value": wrong.seconds, "expected": right.seconds})
