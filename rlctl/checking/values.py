@@ -99,6 +99,15 @@ def list_own_classes(author: Any) -> list[type]:
     return [cls for cls in type(author).__mro__ if cls.__module__.partition(".")[0] not in known]
 
 
+def list_source_files(env: Any) -> list[str]:
+    """Return the files that define the classes of an environment's author; one without a source has none."""
+    files: set[str] = set()
+    for cls in list_own_classes(find_author(env)):
+        with contextlib.suppress(TypeError):  # of a class in C, or of a module that is not a file
+            files.add(str(inspect.getsourcefile(cls)))
+    return sorted(files)
+
+
 def find_batch(env: Any) -> Any:
     """Return the `BatchTask` of an environment; None for any other."""
     batches = sys.modules.get("rlctl.task.batch")

@@ -24,7 +24,7 @@ from rlctl_robot.identify.window_equations import (
 from rlctl_robot.identify.windows import WindowPlayer
 
 _MOST_ITERATIONS = 60
-ENOUGH = 0.1  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
+ENOUGH = 0.3  # smallest decrease of the cost, which is minus the logarithm of a likelihood, to continue
 _REUSED = 10.0  # promised decrease, relative to the smallest to continue, above which derivatives may be old
 _UNSTABLE = 1e30  # cost of a simulation without finite positions
 _NEAR = 0.1  # decrease of the cost per reading, below which derivatives hold for the next step too

@@ -6,7 +6,6 @@ A robot that is written in NumPy has its state there, and clocks and other thing
 import ast
 import contextlib
 import dataclasses
-import inspect
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
@@ -30,6 +29,7 @@ from rlctl.checking.values import (
     find_numbers,
     flatten_action,
     list_own_classes,
+    list_source_files,
     read_attributes,
 )
 from rlctl.checking.worlds import JOINTS, World
@@ -252,9 +252,9 @@ def _is_number(value: Any) -> bool:
 def _find_literals(env: Any) -> set[float]:
     """Return the numbers that the source of its classes' modules has."""
     found: set[float] = set()
-    for file in {inspect.getsourcefile(cls) for cls in list_own_classes(find_author(env))}:
-        with contextlib.suppress(OSError, TypeError, SyntaxError, ValueError):
-            with open(str(file), encoding="utf-8") as source:
+    for file in list_source_files(env):
+        with contextlib.suppress(OSError, SyntaxError, ValueError):
+            with open(file, encoding="utf-8") as source:
                 values = [node.value for node in ast.walk(ast.parse(source.read())) if isinstance(node, ast.Constant)]
             found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found

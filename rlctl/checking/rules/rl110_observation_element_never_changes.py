@@ -20,7 +20,8 @@ RULE = Rule(
         Elements of the observation had one value for all seeds, episodes and steps. They carry no information;
         often the index is wrong. Normalisation divides such an element by nearly nothing: the first time it
         changes, the network gets a huge number. A warning if a whole array of floats is constant, else an info:
-        a trained policy may change the element, and masks, maps and targets are often constant.
+        a trained policy may change the element, and masks, maps and targets are often constant. A single whole
+        number counts as such an element: it may be a flag, or the number of goals that are left.
     """,
     fix="""
         Check the index or slice it is read from, and that step updates it. If it is constant by nature, leave
@@ -38,13 +39,19 @@ def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
         rows = read_rows(records, index)
         constant = _constant(rows, leaf)
         total += rows.shape[1]
-        has_constant_leaf |= np.dtype(leaf.dtype).kind == "f" and len(constant) == rows.shape[1]
+        is_whole = len(constant) == rows.shape[1]
+        has_constant_leaf |= is_whole and np.dtype(leaf.dtype).kind == "f" and not _is_counter(rows)
         names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
     if names:
         message = f"{len(names)} of {total} elements of the observation never changed: {list_names(names)}"
         evidence = {"value": len(names), "expected": 0, "elements": [name.partition(" (")[0] for name in names[:8]]}
         is_likely = has_constant_leaf and total > 1  # masks, maps and the single number of a bandit seldom change
         yield RuleFinding(RULE, message, evidence, Severity.WARNING if is_likely else Severity.INFO)
+
+
+def _is_counter(rows: NDArray[np.float64]) -> bool:
+    """Return whether it may count what only a trained policy does, such as goals that are left."""
+    return rows.shape[1] == 1 and float(rows[0, 0]).is_integer()
 
 
 def _constant(rows: NDArray[np.float64], leaf: Leaf) -> NDArray[np.intp]:

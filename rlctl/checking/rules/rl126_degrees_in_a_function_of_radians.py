@@ -2,7 +2,6 @@
 
 import ast
 import contextlib
-import inspect
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -11,7 +10,7 @@ from rlctl.checking.experiments.attributes import find_declared_numbers
 from rlctl.checking.experiments.build import judges_built
 from rlctl.checking.instance import Instance
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.checking.values import find_author, list_own_classes
+from rlctl.checking.values import find_author, list_own_classes, list_source_files
 
 RULE = Rule(
     "RL126",
@@ -37,7 +36,7 @@ def _find_degrees(instance: Instance) -> Iterator[RuleFinding]:
     classes = list_own_classes(find_author(instance.env))
     declared = find_declared_numbers(instance.env)
     names = {cls.__name__ for cls in classes}
-    for file in sorted({str(inspect.getsourcefile(cls)) for cls in classes}):
+    for file in list_source_files(instance.env):
         with contextlib.suppress(OSError, SyntaxError, ValueError):
             with open(file, encoding="utf-8") as source:
                 tree = ast.parse(source.read())
@@ -72,7 +71,7 @@ def _list_angles(call: ast.Call) -> Sequence[ast.expr]:
         return call.args
     if (
         name in ROTATIONS
-        and len(call.args) > ROTATIONS[name]
+        and len(call.args) == ROTATIONS[name] + 1  # the next argument may say that they are degrees
         and not any(one.arg == "degrees" for one in call.keywords)
     ):
         angles = call.args[ROTATIONS[name]]
