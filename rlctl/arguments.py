@@ -34,7 +34,7 @@ def complete_task(incomplete: str) -> list[str]:
 
 def complete_algorithm(incomplete: str) -> list[str]:
     """Return the algorithms that begin with `incomplete`."""
-    known = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo")
+    known = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "xqc", "recurrent_ppo")
     return [name for name in known if name.startswith(incomplete)]
 
 

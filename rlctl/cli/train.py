@@ -17,7 +17,7 @@ class RecipeFlags:
 
     settings: Settings = dataclasses.field(default_factory=list)
     algo: Annotated[
-        str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", completes="algorithm")
+        str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq, xqc or recurrent_ppo.", completes="algorithm")
     ] = None
     seed: Annotated[int | None, Option("Seed of everything random.")] = None
     total_timesteps: Annotated[

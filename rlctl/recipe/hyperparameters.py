@@ -169,6 +169,15 @@ class CrossQ(_MaximumEntropy):
     """Critic updates per update of the actor."""
 
 
+class Xqc(CrossQ):
+    """XQC: CrossQ with weight normalisation and categorical critics; it needs normalised rewards."""
+
+    learning_rate: _Schedule = 3e-4
+    ent_coef: _EntropyCoefficient = "auto_0.01"
+    target_entropy: Number | Literal["auto"] = "auto"
+    """Target entropy of `ent_coef: auto`; `auto`: minus half the number of action elements."""
+
+
 class Ddpg(_Continuous):
     """Deep deterministic policy gradient."""
 
@@ -218,5 +227,6 @@ ALGORITHM_PARAMETERS: dict[str, type[Parameters]] = {
     "dqn": Dqn,
     "tqc": Tqc,
     "crossq": CrossQ,
+    "xqc": Xqc,
     "recurrent_ppo": RecurrentPpo,
 }
