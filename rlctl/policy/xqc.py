@@ -1,7 +1,8 @@
 """XQC in the form of sb3-contrib's algorithms: CrossQ with weight normalization and a categorical critic.
 
 D. Palenicek et al., XQC: Well-conditioned Optimization Accelerates Deep Reinforcement Learning, 2025,
-https://arxiv.org/abs/2509.25174. `docs/recipe.md` lists what differs from the paper.
+https://arxiv.org/abs/2509.25174. Unlike there, activations come before the batch normalization and there are no target
+networks, as in CrossQ.
 """
 
 from collections import defaultdict
@@ -26,7 +27,8 @@ class XqcCritic(CrossQCritic):
         super().__init__(*args, **kwargs)
         for network in self.q_networks:
             assert isinstance(network, nn.Sequential)
-            network[-1] = nn.Linear(network[-1].in_features, n_atoms)
+            head: Any = network[-1]
+            network[-1] = nn.Linear(head.in_features, n_atoms)
         self.register_buffer("support", torch.linspace(v_min, v_max, n_atoms), persistent=False)
 
     def compute_logits(self, obs: Any, actions: Tensor) -> Tensor:
@@ -42,11 +44,7 @@ class XqcCritic(CrossQCritic):
         return tuple(self.compute_values(self.compute_logits(obs, actions)))
 
     def project(self, probabilities: Tensor, returns: Tensor) -> Tensor:
-        """Move each probability from its return to the nearest two atoms; shape (batch, atoms) each.
-
-        M. Bellemare et al., A Distributional Perspective on Reinforcement Learning, 2017,
-        https://arxiv.org/abs/1707.06887.
-        """
+        """Move each probability from its return to the nearest two atoms; shape (batch, atoms) each."""
         v_min, v_max, last = self.support[0], self.support[-1], len(self.support) - 1
         places = (returns.clamp(v_min, v_max) - v_min) * (last / (v_max - v_min))
         below = places.floor().clamp(0, last - 1)
@@ -73,13 +71,9 @@ class XqcPolicy(CrossQPolicy):
         **kwargs: Any,
     ) -> None:
         self._atoms: dict[str, Any] = {"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max}
-        super().__init__(
-            *args,
-            net_arch=net_arch or [256, 256],
-            optimizer_class=optimizer_class,
-            optimizer_kwargs=optimizer_kwargs or {},  # CrossQ has another momentum
-            **kwargs,
-        )
+        kwargs |= {"net_arch": net_arch or [256, 256], "optimizer_class": optimizer_class}
+        kwargs["optimizer_kwargs"] = optimizer_kwargs or {}  # CrossQ has another momentum
+        super().__init__(*args, **kwargs)
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)

@@ -170,7 +170,13 @@ class CrossQ(_MaximumEntropy):
 
 
 class Xqc(CrossQ):
-    """XQC: CrossQ with weight normalisation and categorical critics; it needs normalised rewards."""
+    """XQC: CrossQ with weights of unit norm and critics that estimate the distribution of the return.
+
+    D. Palenicek et al., [XQC](https://arxiv.org/abs/2509.25174), 2025. Unlike there, activations come before the batch
+    normalisation and there are no target networks, as in CrossQ, and the networks are narrower. It needs rewards that
+    are divided by the standard deviation of the return, as its default `normalize` does; `v_min` and `v_max` bound the
+    values of such rewards.
+    """
 
     learning_rate: _Schedule = 3e-4
     ent_coef: _EntropyCoefficient = "auto_0.01"

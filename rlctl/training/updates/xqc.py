@@ -5,37 +5,26 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rlctl.policy.xqc import XQC, project_weights
+from rlctl.training.updates.blocks import Arrays
 from rlctl.training.updates.crossq import CrossQGradients, CrossQUpdate
 from rlctl.training.updates.perceptrons import Floats
-from rlctl.training.updates.sac_gradients import CRITICS, SacGradients
+from rlctl.training.updates.sac_gradients import CRITICS, SacGradients, SacSettings
 
 
 class XqcGradients(CrossQGradients):
     """CrossQ's gradients for critics that estimate the distribution of the return."""
 
-    @property
-    def _support(self) -> Floats:
-        assert self._settings.atoms is not None
-        return np.linspace(*self._settings.atoms, self._settings.critic[-1], dtype=np.float32)
+    def __init__(self, arrays: Arrays, settings: SacSettings) -> None:
+        super().__init__(arrays, settings)
+        assert settings.atoms is not None
+        self._support = np.linspace(*settings.atoms, settings.critic[-1], dtype=np.float32)
 
     def _make_target(self, outputs: Floats, penalty: Floats, rows: slice) -> Floats:
         """Return the distribution of the return, projected to the atoms; shape (batch, atoms)."""
         probabilities = _softmax(outputs)
         worse = (probabilities @ self._support).argmin(0)
         returns = self._take("rewards", rows) + self._take("discounts", rows) * (self._support - penalty)
-        return self._project(probabilities[worse, np.arange(len(worse))], returns)
-
-    def _project(self, probabilities: Floats, returns: Floats) -> Floats:
-        """Move each probability from its return to the nearest two atoms; shape (batch, atoms) each."""
-        first, last = self._support[[0, -1]]
-        count = len(self._support)
-        places = (returns.clip(first, last) - first) * ((count - 1) / (last - first))
-        below = np.floor(places).clip(0, count - 2)
-        above = probabilities * (places - below)
-        index = (below.astype(np.intp) + np.arange(len(below))[:, None] * count).ravel()
-        projected = np.bincount(index, (probabilities - above).ravel(), below.size)
-        projected[1:] += np.bincount(index, above.ravel(), below.size)[:-1]
-        return projected.reshape(below.shape).astype(np.float32)
+        return project(probabilities[worse, np.arange(len(worse))], returns, self._support)
 
     def _compute_loss(self, outputs: Floats, target: Floats) -> float:
         logits = outputs - outputs.max(-1, keepdims=True)
@@ -50,6 +39,22 @@ class XqcGradients(CrossQGradients):
         values = (probabilities @ self._support)[..., None]
         value, to_values = super()._value(values)
         return value, to_values * probabilities * (self._support - values)
+
+
+def project(probabilities: Floats, returns: Floats, support: Floats) -> Floats:
+    """Move each probability from its return to the nearest two atoms of `support`; shape (batch, atoms) each.
+
+    M. Bellemare et al., A Distributional Perspective on Reinforcement Learning, 2017, https://arxiv.org/abs/1707.06887.
+    """
+    first, last = support[[0, -1]]
+    count = len(support)
+    places = (returns.clip(first, last) - first) * ((count - 1) / (last - first))
+    below = np.floor(places).clip(0, count - 2)
+    above = probabilities * (places - below)
+    index = (below.astype(np.intp) + np.arange(len(below))[:, None] * count).ravel()
+    projected = np.bincount(index, (probabilities - above).ravel(), below.size)
+    projected[1:] += np.bincount(index, above.ravel(), below.size)[:-1]
+    return projected.reshape(below.shape).astype(np.float32)
 
 
 def _softmax(logits: Floats) -> Floats:
