@@ -308,6 +308,7 @@ def test_what_sb3_updates_itself():
     sac = [make_off_policy(network=elu), make_off_policy(network={"net_arch": []}), make_off_policy(TQC)]
     sac += [make_off_policy(observations=image, policy="CnnPolicy")]
     sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
+    sac += [make_off_policy(XQC, network=elu)]
     assert [choose_update(model) for model in ppo] == ppo
     assert not SacUpdate.supports(sac.pop(2))
     assert [choose_update(model) for model in sac] == sac
