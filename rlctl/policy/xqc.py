@@ -129,8 +129,10 @@ class XQC(CrossQ):
     }
     critic: XqcCritic
 
-    def __init__(self, *args: Any, ent_coef: str | float = "auto_0.01", **kwargs: Any) -> None:
-        kwargs["ent_coef"] = ent_coef
+    def __init__(
+        self, *args: Any, learning_rate: Any = 3e-4, ent_coef: str | float = "auto_0.01", **kwargs: Any
+    ) -> None:
+        kwargs |= {"learning_rate": learning_rate, "ent_coef": ent_coef}
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
