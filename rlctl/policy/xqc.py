@@ -1,8 +1,8 @@
-"""XQC in the form of sb3-contrib's algorithms: CrossQ with weight normalization and a categorical critic.
+"""XQC in the form of sb3-contrib's algorithms: CrossQ whose critics are categorical and have weights of unit norm.
 
 D. Palenicek et al., XQC: Well-conditioned Optimization Accelerates Deep Reinforcement Learning, 2025,
-https://arxiv.org/abs/2509.25174. Unlike there, activations come before the batch normalization and there are no target
-networks, as in CrossQ.
+https://arxiv.org/abs/2509.25174. Unlike there, the actor, the target entropy and the order of layers are CrossQ's, and
+there are no target networks.
 """
 
 from collections import defaultdict
@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from sb3_contrib import CrossQ
-from sb3_contrib.crossq.policies import Actor, CrossQCritic, CrossQPolicy
+from sb3_contrib.crossq.policies import CrossQCritic, CrossQPolicy
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import Tensor, nn
@@ -30,6 +30,18 @@ class XqcCritic(CrossQCritic):
             head: Any = network[-1]
             network[-1] = nn.Linear(head.in_features, n_atoms)
         self.register_buffer("support", torch.linspace(v_min, v_max, n_atoms), persistent=False)
+        self.project_weights()
+
+    @torch.no_grad()
+    def project_weights(self) -> None:
+        """Scale the weights into each unit to the norm 1; those of a hidden unit with its bias."""
+        for network in self.q_networks:
+            *hidden, head = (module for module in network.children() if isinstance(module, nn.Linear))
+            for linear in hidden:
+                factor = (linear.weight.square().sum(1) + linear.bias.square()).rsqrt_()
+                linear.weight.mul_(factor[:, None])
+                linear.bias.mul_(factor)
+            head.weight.div_(head.weight.norm(dim=1, keepdim=True))
 
     def compute_logits(self, obs: Any, actions: Tensor) -> Tensor:
         """Return the logarithms of the probabilities, not normalized; shape (critics, batch, atoms)."""
@@ -55,7 +67,7 @@ class XqcCritic(CrossQCritic):
 
 
 class XqcPolicy(CrossQPolicy):
-    """The networks of CrossQ, with weights of unit norm."""
+    """The actor of CrossQ, and categorical critics."""
 
     critic: XqcCritic
 
@@ -66,19 +78,11 @@ class XqcPolicy(CrossQPolicy):
         n_atoms: int = 101,
         v_min: float = -5.0,
         v_max: float = 5.0,
-        optimizer_class: Any = torch.optim.Adam,
-        optimizer_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         self._atoms: dict[str, Any] = {"n_atoms": n_atoms, "v_min": v_min, "v_max": v_max}
-        kwargs |= {"net_arch": net_arch or [256, 256], "optimizer_class": optimizer_class}
-        kwargs["optimizer_kwargs"] = optimizer_kwargs or {}  # CrossQ has another momentum
+        kwargs["net_arch"] = net_arch or [256, 256]
         super().__init__(*args, **kwargs)
-
-    def _build(self, lr_schedule: Any) -> None:
-        super()._build(lr_schedule)
-        project_weights(self.actor)
-        project_weights(self.critic)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | self._atoms
@@ -96,30 +100,6 @@ class XqcMultiInputPolicy(XqcPolicy):
         super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
 
 
-@torch.no_grad()
-def project_weights(networks: Actor | CrossQCritic) -> None:
-    """Scale the weights into each unit to the norm 1; those of a hidden unit with its bias."""
-    if isinstance(networks, CrossQCritic):
-        stacks = [_list_linear(network) for network in networks.q_networks]
-        hidden = [linear for stack in stacks for linear in stack[:-1]]
-        heads = [stack[-1] for stack in stacks]
-    else:
-        hidden = _list_linear(networks.latent_pi)
-        heads = [*_list_linear(networks.mu), *_list_linear(networks.log_std)]
-    for linear in hidden:
-        factor = (linear.weight.square().sum(1) + linear.bias.square()).rsqrt_()
-        linear.weight.mul_(factor[:, None])
-        linear.bias.mul_(factor)
-    for linear in heads:
-        linear.weight.div_(linear.weight.norm(dim=1, keepdim=True))
-
-
-def _list_linear(network: Any) -> list[nn.Linear]:
-    """Return the linear layers; none for the parameter that gSDE has instead of a layer."""
-    modules = network.modules() if isinstance(network, nn.Module) else ()
-    return [module for module in modules if isinstance(module, nn.Linear)]
-
-
 class XQC(CrossQ):
     """CrossQ whose critics learn the distribution of the return by cross-entropy."""
 
@@ -129,16 +109,9 @@ class XQC(CrossQ):
     }
     critic: XqcCritic
 
-    def __init__(
-        self, *args: Any, learning_rate: Any = 3e-4, ent_coef: str | float = "auto_0.01", **kwargs: Any
-    ) -> None:
-        kwargs |= {"learning_rate": learning_rate, "ent_coef": ent_coef}
+    def __init__(self, *args: Any, ent_coef: str | float = "auto_0.01", **kwargs: Any) -> None:
+        kwargs["ent_coef"] = ent_coef
         super().__init__(*args, **kwargs)
-
-    def _setup_model(self) -> None:
-        share = 0.5 if self.target_entropy == "auto" else 1.0
-        super()._setup_model()
-        self.target_entropy = share * float(self.target_entropy)
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Do `gradient_steps` updates with minibatches of the replay buffer."""
@@ -177,7 +150,8 @@ class XQC(CrossQ):
             returns = data.rewards + (1 - data.dones) * discounts * returns
             target = self.critic.project(probabilities, returns)
         loss = -(target * functional.log_softmax(now, -1)).sum(-1).mean(1).sum()
-        _step(self.critic, loss)
+        _step(self.critic.optimizer, loss)
+        self.critic.project_weights()
         return loss.item()
 
     def _learn_actor(self, data: Any, coefficient: Tensor, logged: dict[str, list[float]]) -> None:
@@ -187,14 +161,12 @@ class XQC(CrossQ):
         if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
             loss = -(self.log_ent_coef * (log_prob.detach() + float(self.target_entropy))).mean()
             logged["ent_coef_loss"].append(loss.item())
-            self.ent_coef_optimizer.zero_grad()
-            torch.autograd.backward(loss)
-            self.ent_coef_optimizer.step()
+            _step(self.ent_coef_optimizer, loss)
         self.critic.set_bn_training_mode(False)
         values = torch.stack(self.critic(data.observations, actions)).amin(0)
         loss = (coefficient * log_prob[:, None] - values).mean()
         logged["actor_loss"].append(loss.item())
-        _step(self.actor, loss)
+        _step(self.actor.optimizer, loss)
 
 
 def _join(observations: Any, others: Any) -> Any:
@@ -203,8 +175,7 @@ def _join(observations: Any, others: Any) -> Any:
     return torch.cat([observations, others])
 
 
-def _step(networks: Any, loss: Tensor) -> None:
-    networks.optimizer.zero_grad()
+def _step(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    optimizer.zero_grad()
     torch.autograd.backward(loss)
-    networks.optimizer.step()
-    project_weights(networks)
+    optimizer.step()

@@ -170,18 +170,15 @@ class CrossQ(_MaximumEntropy):
 
 
 class Xqc(CrossQ):
-    """XQC: CrossQ with weights of unit norm and critics that estimate the distribution of the return.
+    """XQC: CrossQ whose critics have weights of unit norm and estimate the distribution of the return.
 
-    D. Palenicek et al., [XQC](https://arxiv.org/abs/2509.25174), 2025. Unlike there, activations come before the batch
-    normalisation and there are no target networks, as in CrossQ, and the networks are narrower. It needs rewards that
-    are divided by the standard deviation of the return, as its default `normalize` does; `v_min` and `v_max` bound the
-    values of such rewards.
+    D. Palenicek et al., [XQC](https://arxiv.org/abs/2509.25174), 2025. Unlike there, the actor, the target entropy and
+    the order of layers are those of CrossQ, there are no target networks, and the networks are narrower. It needs
+    rewards that are divided by the standard deviation of the return, as its default `normalize` does; `v_min` and
+    `v_max` bound the values of such rewards.
     """
 
-    learning_rate: _Schedule = 3e-4
     ent_coef: _EntropyCoefficient = "auto_0.01"
-    target_entropy: Number | Literal["auto"] = "auto"
-    """Target entropy of `ent_coef: auto`; `auto`: minus half the number of action elements."""
 
 
 class Ddpg(_Continuous):

@@ -168,7 +168,7 @@ class BatchNormCritics(SquashedActor):
 
 
 class CategoricalCritics(BatchNormCritics):
-    """The networks of XQC."""
+    """The networks of XQC: the actor of CrossQ, and categorical critics."""
 
     net_arch: _Layers | _ActorAndCritic | None = _widths(
         "[256, 256]", "[256, 256]", "{pi: [256, 256], qf: [512, 512, 512, 512]}"

@@ -1,4 +1,4 @@
-"""The networks of XQC: distributions of the return on fixed atoms, and weights of unit norm."""
+"""The critics of XQC: distributions of the return on fixed atoms, and weights of unit norm."""
 
 import numpy as np
 import pytest
@@ -40,15 +40,13 @@ def test_a_value_is_the_expected_return():
     assert [value.shape for value in values] == [(5, 1), (5, 1)]
 
 
-@pytest.mark.parametrize("use_sde", [False, True])
-def test_the_weights_into_each_unit_have_unit_norm(use_sde):
-    policy = make_policy(use_sde=use_sde)
-    heads = {"actor.mu", "actor.mu.0", "actor.log_std", "critic.qf0.7", "critic.qf1.7"}
-    linear = {name: module for name, module in policy.named_modules() if isinstance(module, torch.nn.Linear)}
-    assert len(linear) == 2 + (1 if use_sde else 2) + 2 * 3
+def test_the_weights_into_each_unit_of_a_critic_have_unit_norm():
+    critic = make_policy().critic
+    linear = {name: module for name, module in critic.named_modules() if isinstance(module, torch.nn.Linear)}
+    assert list(linear) == [f"qf{network}.{index}" for network in (0, 1) for index in (1, 4, 7)]
     for name, layer in linear.items():
         square = layer.weight.square().sum(1)
-        if name not in heads:
+        if not name.endswith("7"):  # a hidden layer
             square += layer.bias.square()
         torch.testing.assert_close(square, torch.ones_like(square), msg=name)
 

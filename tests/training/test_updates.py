@@ -243,7 +243,7 @@ XQC_CASES = {
     "xqc": {},
     "xqc, gSDE, tanh, three critics": {"use_sde": True, "network": {"activation_fn": torch.nn.Tanh, "n_critics": 3}},
     "xqc, returns outside of the atoms": {"network": {"n_atoms": 11, "v_min": -0.5, "v_max": 0.25}, "ent_coef": 0.2},
-    "xqc, several steps, normalized": {"n_steps": 3, "normalize": True, "policy_delay": 1},
+    "xqc, several steps, normalized": {"n_steps": 3, "normalize": True, "policy_delay": 1, "seed": 1},
     "xqc, dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
     "xqc, privileged": {"policy": POLICIES["xqc"], "network": PRIVILEGED, "seed": 2},
     "xqc, no batch normalization": {"network": {"batch_norm": False}},

@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rlctl.policy.xqc import XQC, project_weights
+from rlctl.policy.xqc import XQC
 from rlctl.training.updates.blocks import Arrays
 from rlctl.training.updates.crossq import CrossQGradients, CrossQUpdate
 from rlctl.training.updates.perceptrons import Floats
@@ -71,4 +71,5 @@ class XqcUpdate(CrossQUpdate):
 
     def _step(self, phase: int) -> None:
         super()._step(phase)
-        project_weights(self._model.critic if phase == CRITICS else self._model.actor)
+        if phase == CRITICS:
+            self._model.critic.project_weights()
