@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import json
 import pathlib
@@ -85,7 +86,7 @@ def render_recipe_page() -> str:
         for key, models in (("algo_kwargs", ALGORITHM_PARAMETERS), ("policy_kwargs", NETWORK_PARAMETERS)):
             model = models[algo]
             heading = f"## {algo}\n\n" if key == "algo_kwargs" else ""
-            lines += ["", f"{heading}`{key}`: {(model.__doc__ or '').strip()}", ""]
+            lines += ["", f"{heading}`{key}`: {inspect.cleandoc(model.__doc__ or '')}", ""]
             lines += _render_table(build_schema(algo), (key,))
     return "\n".join(lines) + "\n"
 

@@ -54,6 +54,7 @@ LAYERS = [
 TORCH = {"torch", "stable_baselines3", "sb3_contrib"}
 MAY_IMPORT_TORCH = {  # besides training/
     "rlctl/policy/torch_policy.py",
+    "rlctl/policy/xqc.py",
 }
 
 

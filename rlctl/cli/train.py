@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Annotated, Any
 
-from rlctl.arguments import choose_checkpoint, command_in_panels
+from rlctl.arguments import ALGORITHMS, choose_checkpoint, command_in_panels
 from rlctl.errors import UsageError
 from rlctl.launching.distill_request import DistillRequest
 from rlctl.options import Cluster, Jobs, Json, On, Option, Pretrained, Settings, SimOption
@@ -16,9 +16,9 @@ class RecipeFlags:
     """Recipe keys from the command line; a flag overrides `--set`."""
 
     settings: Settings = dataclasses.field(default_factory=list)
-    algo: Annotated[
-        str | None, Option("ppo, a2c, sac, td3, ddpg, dqn, tqc, crossq or recurrent_ppo.", completes="algorithm")
-    ] = None
+    algo: Annotated[str | None, Option(f"{', '.join(ALGORITHMS[:-1])} or {ALGORITHMS[-1]}.", completes="algorithm")] = (
+        None
+    )
     seed: Annotated[int | None, Option("Seed of everything random.")] = None
     total_timesteps: Annotated[
         str | None, Option("Environment steps; 1e6 is fine.", ("--total-timesteps", "-n"), metavar="STEPS")

@@ -21,7 +21,7 @@ from rlctl.storage import files, untrusted
 
 FORMAT = 1
 
-SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq")
+SQUASHED_GAUSSIAN = ("sac", "tqc", "crossq", "xqc")
 DETERMINISTIC = ("td3", "ddpg")  # algorithms whose policy has no distribution to sample from
 ACTOR_CRITIC = (*SQUASHED_GAUSSIAN, *DETERMINISTIC)  # algorithms whose policy has a separate `actor`
 GRAPH = "graph/actor"  # the tensor that holds a user's network, an ONNX graph as bytes; see `rlctl.policy.onnx_policy`

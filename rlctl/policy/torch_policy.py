@@ -21,6 +21,7 @@ from rlctl.policy.actor import Array, Rows, as_stored
 from rlctl.policy.file import PolicyFile, PolicyInfo, list_actor_tensors
 from rlctl.policy.network import read_normalization
 from rlctl.policy.policy import FileActor, Policy
+from rlctl.policy.xqc import XQC
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": stable_baselines3.PPO,
@@ -31,6 +32,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "dqn": stable_baselines3.DQN,
     "tqc": sb3_contrib.TQC,
     "crossq": sb3_contrib.CrossQ,
+    "xqc": XQC,
     "recurrent_ppo": sb3_contrib.RecurrentPPO,
 }
 

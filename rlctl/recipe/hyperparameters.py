@@ -169,6 +169,18 @@ class CrossQ(_MaximumEntropy):
     """Critic updates per update of the actor."""
 
 
+class Xqc(CrossQ):
+    """XQC: CrossQ whose critics have weights of unit norm and estimate the distribution of the return.
+
+    D. Palenicek et al., [XQC](https://arxiv.org/abs/2509.25174), 2025. Unlike there, the actor, the target entropy and
+    the order of layers are those of CrossQ, there are no target networks, and the networks are narrower. It needs
+    rewards that are divided by the standard deviation of the return, as its default `normalize` does; `v_min` and
+    `v_max` bound the values of such rewards.
+    """
+
+    ent_coef: _EntropyCoefficient = "auto_0.01"
+
+
 class Ddpg(_Continuous):
     """Deep deterministic policy gradient."""
 
@@ -218,5 +230,6 @@ ALGORITHM_PARAMETERS: dict[str, type[Parameters]] = {
     "dqn": Dqn,
     "tqc": Tqc,
     "crossq": CrossQ,
+    "xqc": Xqc,
     "recurrent_ppo": RecurrentPpo,
 }

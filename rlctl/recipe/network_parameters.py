@@ -1,8 +1,9 @@
 """The parameters of the networks of every algorithm, `policy_kwargs`: SB3's names, with the type and range of each."""
 
+import math
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PlainSerializer, ValidationInfo, WrapValidator
+from pydantic import Field, PlainSerializer, ValidationInfo, WrapValidator, field_validator
 
 from rlctl.recipe.hyperparameters import Parameters
 from rlctl.storage.validation import Number, Switch, Whole
@@ -166,6 +167,27 @@ class BatchNormCritics(SquashedActor):
     """Gradient steps before batch renormalisation begins."""
 
 
+class CategoricalCritics(BatchNormCritics):
+    """The networks of XQC: the actor of CrossQ, and categorical critics."""
+
+    net_arch: _Layers | _ActorAndCritic | None = _widths(
+        "[256, 256]", "[256, 256]", "{pi: [256, 256], qf: [512, 512, 512, 512]}"
+    )
+    n_atoms: Annotated[Whole, Field(ge=2, le=10_000)] = 101
+    """Returns whose probabilities a critic estimates."""
+    v_min: Number = -5.0
+    """The lowest of these returns, of normalised rewards."""
+    v_max: Number = Field(5.0, validate_default=True)
+    """The highest of these returns; above `v_min`."""
+
+    @field_validator("v_max")
+    @classmethod
+    def _check_bounds(cls, v_max: float, others: ValidationInfo) -> float:
+        if v_max <= (v_min := others.data.get("v_min", -math.inf)):
+            raise ValueError(f"{v_max:g} is not above v_min, {v_min:g}")
+        return v_max
+
+
 NETWORK_PARAMETERS: dict[str, type[Parameters]] = {
     "ppo": ActorCritic,
     "a2c": ActorCritic,
@@ -175,5 +197,6 @@ NETWORK_PARAMETERS: dict[str, type[Parameters]] = {
     "dqn": QNetwork,
     "tqc": QuantileCritics,
     "crossq": BatchNormCritics,
+    "xqc": CategoricalCritics,
     "recurrent_ppo": RecurrentActorCritic,
 }

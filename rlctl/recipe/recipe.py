@@ -19,12 +19,12 @@ from rlctl.recipe.stages import FollowingLevel, Stage, check_promotions
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Number, Section, Switch, Whole
 
-Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "recurrent_ppo"]
+Algorithm = Literal["ppo", "a2c", "sac", "td3", "ddpg", "dqn", "tqc", "crossq", "xqc", "recurrent_ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
-IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc")
+IN_HINDSIGHT: tuple[Algorithm, ...] = ("sac", "td3", "ddpg", "dqn", "tqc", "xqc")
 """Algorithms with hindsight replay: those with a replay buffer, except crossq, which has no network for Dict spaces."""
 
-WITH_PRIVILEGED: tuple[Algorithm, ...] = ("ppo", "a2c", "recurrent_ppo", "sac", "tqc")
+WITH_PRIVILEGED: tuple[Algorithm, ...] = ("ppo", "a2c", "recurrent_ppo", "sac", "tqc", "xqc")
 """Algorithms whose critic may see more than the actor."""
 
 SCHEMA_FILE = Path(__file__).with_name("recipe.schema.json")
@@ -118,7 +118,7 @@ class Recipe(Section):
     mirror_loss: float = Field(0.0, ge=0, le=1e6)
     """PPO: weight of the squared difference between a mirror image's mean action and the mirrored mean action."""
     normalize: NormalizeSettings | None = Field(
-        None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; else neither")
+        None, json_schema_extra=decide_by("both for ppo, a2c, recurrent_ppo; rewards for xqc; else neither")
     )
     """Running normalisation of observations and rewards."""
     frame_stack: Whole = Field(1, ge=1, le=1000)

@@ -151,7 +151,7 @@ def fill_defaults(recipe: Recipe) -> Recipe:
         kwargs.setdefault("train_freq", 1)
         kwargs.setdefault("buffer_size", min(1_000_000, max(recipe.total_timesteps, 1_000)))
     if recipe.normalize is None:
-        changes["normalize"] = NormalizeSettings(observation=on_policy, reward=on_policy)
+        changes["normalize"] = NormalizeSettings(observation=on_policy, reward=on_policy or recipe.algo == "xqc")
     if recipe.eval.every_steps is None:
         changes["eval"] = recipe.eval.model_copy(update={"every_steps": max(1, recipe.total_timesteps // 10)})
     return recipe.model_copy(update=changes)

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from rlctl.environments.dict_spaces import split_space
 from rlctl.errors import RecipeError, RlctlError, UsageError, short_repr
 from rlctl.play.workers import Workers
+from rlctl.policy.file import ACTOR_CRITIC
 from rlctl.policy.own_modules import import_named
 from rlctl.policy.torch_policy import ACTIVATIONS, ALGORITHMS, policy_name
 from rlctl.recipe.hyperparameters import LINEAR, split_schedule
@@ -36,7 +37,7 @@ from rlctl.training.updates.ppo import PpoUpdate
 _FLOAT32 = 4  # [bytes]
 _USABLE_SHARE = 0.9  # of the free memory; the environments need memory too
 _DELAYED_BY_US = frozenset({"sac", "tqc"})  # algorithms whose `policy_delay` Stable-Baselines3 does not have
-_CONTINUOUS = frozenset({"sac", "td3", "ddpg", "tqc", "crossq"})
+_CONTINUOUS = frozenset(ACTOR_CRITIC)
 
 
 def build_on_device(

@@ -1,4 +1,4 @@
-"""SAC, TQC, CrossQ, TD3, DDPG and DQN on chunks of steps, with overlap and with hindsight experience replay.
+"""SAC, TQC, CrossQ, XQC, TD3, DDPG and DQN on chunks of steps, with overlap and with hindsight experience replay.
 
 With overlap workers play while the model learns. With hindsight the model also learns as if the state that an episode
 reached had been its goal: M. Andrychowicz et al., Hindsight Experience Replay, 2017, https://arxiv.org/abs/1707.01495.

@@ -13,7 +13,7 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from rlctl.environments.dict_spaces import SINGLE, join, split, split_space
 from rlctl.errors import RecipeError, describe_exception, short_repr
 from rlctl.policy.actor import Rows, as_rows
-from rlctl.policy.file import ACTOR_CRITIC, GRAPH, OPSET, PolicyFile, Tensors
+from rlctl.policy.file import ACTOR_CRITIC, GRAPH, OPSET, SQUASHED_GAUSSIAN, PolicyFile, Tensors
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.onnx_policy import OWN_INPUT, OWN_OUTPUT
 from rlctl.policy.torch_policy import ACTIVATIONS, TorchActor, is_own
@@ -21,7 +21,7 @@ from rlctl.training.privileged import has_privileged_critic
 
 _COMPARED = 10  # number of random observations
 _HEADS = {"dqn": "q_net", "td3": "actor.mu", "ddpg": "actor.mu"} | dict.fromkeys(
-    ("sac", "tqc", "crossq"), "actor.mu and actor.log_std"
+    SQUASHED_GAUSSIAN, "actor.mu and actor.log_std"
 )
 _CACHE = "rlctl_own_graph"  # attribute of a policy: its graph does not change with its weights
 

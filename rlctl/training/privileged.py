@@ -20,6 +20,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtr
 from stable_baselines3.sac.policies import SACPolicy
 
 from rlctl.play.shared_arrays import CRITIC
+from rlctl.policy.xqc import XqcPolicy
 
 
 def widen_space(space: spaces.Space[Any], privileged: int) -> spaces.Space[Any]:
@@ -171,12 +172,17 @@ class PrivilegedTQCPolicy(_PrivilegedOffPolicy, TQCPolicy):
     """TQC's networks."""
 
 
+class PrivilegedXqcPolicy(_PrivilegedOffPolicy, XqcPolicy):
+    """XQC's networks."""
+
+
 POLICIES: dict[str, Any] = {
     "ppo": PrivilegedActorCriticPolicy,
     "a2c": PrivilegedActorCriticPolicy,
     "recurrent_ppo": PrivilegedRecurrentPolicy,
     "sac": PrivilegedSACPolicy,
     "tqc": PrivilegedTQCPolicy,
+    "xqc": PrivilegedXqcPolicy,
 }
 """The policy of each algorithm whose critic may see more than the actor."""
 

@@ -24,7 +24,7 @@ from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError, explain_missing_package
 from rlctl.hub import store
 from rlctl.policy import own_modules
-from rlctl.recipe.recipe import Recipe, validate
+from rlctl.recipe.recipe import ALGORITHMS, Recipe, validate
 from rlctl.recipe.sources import describe_other_algorithm, describe_rounding, resolve_with_stages
 from rlctl.runs import lookup
 from rlctl.runs.directory import RunDirectory, RunLock
@@ -37,6 +37,7 @@ from rlctl.training.warm_start import find_source
 if TYPE_CHECKING:
     from rlctl.training.checkpoint_file import Checkpoint
 
+_WITHOUT_DEMONSTRATIONS = ("dqn", "recurrent_ppo")
 _NO_CALLBACK = "neither a rlctl.Callback nor a BaseCallback of Stable-Baselines3"
 _DEMONSTRATIONS = (".npz", ".parquet", ".hdf5", ".arrow", ".json")  # suffixes of files
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d+)?|mps|xpu(:\d+)?")
@@ -119,8 +120,9 @@ def _find_new(request: TrainRequest, task: str) -> Start:
         callbacks = _load_callbacks(recipe)
     _check_tracker(recipe)
     source = find_source(request.initial_policy, recipe) if request.initial_policy is not None else None
-    if request.demos is not None and (algo := recipe.algo) in ("dqn", "recurrent_ppo"):
-        raise RecipeError(f"--demos: {algo} cannot clone demonstrations; use ppo, a2c, sac, tqc, crossq, td3 or ddpg")
+    if request.demos is not None and (algo := recipe.algo) in _WITHOUT_DEMONSTRATIONS:
+        others = ", ".join(name for name in ALGORITHMS if name not in _WITHOUT_DEMONSTRATIONS)
+        raise RecipeError(f"--demos: {algo} cannot clone demonstrations; these can: {others}")
     if request.demos is not None and recipe.privileged is not None:
         raise RecipeError("--demos: demonstrations do not hold what only the critic sees; add --set privileged=null")
     notes = describe_other_algorithm(task, request.config, request.settings)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.arguments import complete_algorithm, complete_run, complete_task
+from rlctl.recipe import recipe
 
 
 def test_tasks_and_files(tmp_path, monkeypatch):
@@ -19,7 +20,7 @@ def test_tasks_and_files(tmp_path, monkeypatch):
 
 def test_algorithms():
     assert complete_algorithm("t") == ["td3", "tqc"]
-    assert len(complete_algorithm("")) == 9
+    assert tuple(complete_algorithm("")) == recipe.ALGORITHMS
 
 
 def test_runs(tmp_path, monkeypatch):

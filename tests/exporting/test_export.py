@@ -48,6 +48,7 @@ def assert_verified(report):
         ("sac", "vector", "matrix"),
         pytest.param("td3", "double", "box", marks=pytest.mark.slow),
         pytest.param("crossq", "vector", "box", marks=pytest.mark.slow),
+        pytest.param("xqc", "vector", "box", marks=pytest.mark.slow),
         ("recurrent_ppo", "vector", "box"),
     ],
 )

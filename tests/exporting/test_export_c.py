@@ -80,6 +80,7 @@ SLOW_CASES = [
     ("a2c", "multibinary", "multibinary", {}),
     ("ddpg", "vector", "box", {}),
     ("tqc", "vector", "box", {}),
+    ("xqc", "vector", "box", {}),
     ("recurrent_ppo", "vector", "discrete", {"policy_kwargs": {"lstm_hidden_size": 8}}),
     *(
         ("ppo", "vector", "box", {"policy_kwargs": {"activation_fn": activation}})

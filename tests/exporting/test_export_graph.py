@@ -14,7 +14,7 @@ from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_policy import OnnxActor, encode
 from rlctl.policy.torch_policy import ACTIVATIONS
 
-ALGORITHMS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "recurrent_ppo", "dqn"]
+ALGORITHMS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "xqc", "recurrent_ppo", "dqn"]
 ROWS = 50
 
 

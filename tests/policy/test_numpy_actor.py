@@ -13,7 +13,7 @@ from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError
 from rlctl.policy.actor import Exploration, Rows, as_rows
-from rlctl.policy.file import PolicyFile, PolicyInfo
+from rlctl.policy.file import ACTOR_CRITIC, PolicyFile, PolicyInfo
 from rlctl.policy.load import check_playable
 from rlctl.policy.numpy_actor import NumpyActor
 from rlctl.policy.torch_policy import ALGORITHMS, TorchActor, describe_network, policy_name
@@ -44,6 +44,7 @@ CASES = {
     "sac, image": ("sac", IMAGE, BOX, {}),
     "tqc": ("tqc", FLAT, BOX, {}),
     "crossq": ("crossq", FLAT, BOX, {"policy_kwargs": {"net_arch": [16, 16]}}),
+    "xqc": ("xqc", FLAT, BOX, {"policy_kwargs": {"net_arch": [16, 16]}}),
     "td3": ("td3", FLAT, BOX, {}),
     "ddpg": ("ddpg", FLAT, BOX, {}),
     "dqn": ("dqn", FLAT, spaces.Discrete(5), {}),
@@ -62,7 +63,7 @@ def policy():
     def make(case):
         algo, observation, action, kwargs = CASES[case]
         torch.manual_seed(1)
-        buffer = {"buffer_size": 10} if algo in ("sac", "tqc", "crossq", "td3", "ddpg", "dqn") else {}
+        buffer = {"buffer_size": 10} if algo in (*ACTOR_CRITIC, "dqn") else {}
         env = DummyVecEnv([lambda: Unused(observation, action)])
         network = ALGORITHMS[algo](policy_name(algo, observation), env, device="cpu", **buffer, **kwargs).policy
         for name, values in network.named_buffers():

@@ -232,7 +232,7 @@ def test_predict_with_a_picture_from_0_to_1(saved):
         policy.predict(np.full((36, 40, 3), 0.5))  # it was all black
 
 
-@pytest.mark.parametrize("algo", ["ppo", "sac", "td3", "crossq", "recurrent_ppo"])
+@pytest.mark.parametrize("algo", ["ppo", "sac", "td3", "crossq", "xqc", "recurrent_ppo"])
 def test_an_actor_alone_acts_as_the_whole_policy(tmp_path, algo):
     info = describe(algo, "MlpLstmPolicy" if algo == "recurrent_ppo" else "MlpPolicy", policy_kwargs={"net_arch": [8]})
     tensors = tensors_of(info)

@@ -127,12 +127,15 @@ NETWORK = "expected [64, 64] or {pi: [64, 64], vf: [64, 64]}, got "
         ("ppo", "activation_fn=tahn", "silu or FILE.py:CLASS or MODULE:CLASS, got 'tahn'. Did you mean 'tanh'?"),
         ("ppo", "gama=0.9", "no key 'algo_kwargs.gama' for ppo. Did you mean 'gamma'? Keys here: learning_rate, "),
         ("dqn", "use_sde=true", "no key 'algo_kwargs.use_sde' for dqn."),
+        ("xqc", "v_max=-5", "-5 is not above v_min, -5"),
         ("tqc", "n_quantiles=0", "expected a whole number in [1, 10000], got 0"),
     ],
 )
 def test_hyperparameters_that_make_no_sense(algo, setting, expected):
     name = setting.partition("=")[0]
-    of_the_network = name.startswith(("net_", "log_std", "activation", "features", "n_crit", "lstm", "n_quant"))
+    of_the_network = name.startswith(
+        ("net_", "log_std", "activation", "features", "n_crit", "lstm", "n_quant", "v_max")
+    )
     section = "policy_kwargs" if of_the_network else "algo_kwargs"
     message = refused(None, [f"algo={algo}", f"{section}.{setting}"])
     assert message.startswith((f"{section}.{name}", f"no key '{section}.{name}"))

@@ -137,7 +137,10 @@ def test_what_looks_wrong_and_is_right(tmp_path):
             "stages=[{promote: {success: '0.5'}}]",
             "stage 1: promote.success: expected a number in (0, 1] or null, got '0.5'",
         ),
-        ("algo=[ppo]", "algo: expected ppo or a2c or sac or td3 or ddpg or dqn or tqc or crossq or recurrent_ppo, "),
+        (
+            "algo=[ppo]",
+            "algo: expected ppo or a2c or sac or td3 or ddpg or dqn or tqc or crossq or xqc or recurrent_",
+        ),
         ("stage=[]", "no key 'stage'. Did you mean 'stages'? Keys here: "),
     ],
 )

@@ -30,9 +30,16 @@ NOT_FOR_POLICIES = {
 }
 
 
-def defaults(function, without):
-    parameters = inspect.signature(function).parameters.items()
-    return {name: parameter.default for name, parameter in parameters if name not in without}
+def defaults(cls, without):
+    """Return the arguments of a constructor, with those that it passes on to the class above."""
+    parameters = inspect.signature(cls.__init__).parameters
+    passes_on = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    inherited = defaults(cls.__mro__[1], without) if passes_on else {}
+    return inherited | {
+        name: parameter.default
+        for name, parameter in parameters.items()
+        if name not in without and parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+    }
 
 
 def of_model(model):
@@ -49,12 +56,12 @@ def test_every_algorithm_has_its_models():
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
-def test_names_and_defaults_are_those_of_sb3(algo):
+def test_names_and_defaults_are_those_of_the_classes(algo):
     cls = CLASSES[algo]
     ours = {"policy_delay": 1} if algo in ("sac", "tqc") else {}
-    assert of_model(ALGORITHM_PARAMETERS[algo]) == defaults(cls.__init__, NOT_FOR_RECIPES) | ours
+    assert of_model(ALGORITHM_PARAMETERS[algo]) == defaults(cls, NOT_FOR_RECIPES) | ours
     for policy in cls.policy_aliases.values():
-        assert of_model(NETWORK_PARAMETERS[algo]) == defaults(policy.__init__, NOT_FOR_POLICIES)
+        assert of_model(NETWORK_PARAMETERS[algo]) == defaults(policy, NOT_FOR_POLICIES)
 
 
 @pytest.mark.parametrize("name", PAGES)

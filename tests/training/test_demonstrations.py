@@ -102,6 +102,7 @@ CASES = {
     ),
     "tqc": ("Line", {**TINY_OFF_POLICY, "algo": "tqc"}),
     "crossq": ("Line", {**TINY_OFF_POLICY, "algo": "crossq"}),
+    "xqc": ("Line", {**TINY_OFF_POLICY, "algo": "xqc"}),
     "td3": ("Line", {**TINY_OFF_POLICY, "algo": "td3"}),
 }
 
@@ -114,7 +115,7 @@ QUICK = {"ppo, dict", "sac with gSDE, normalised", "td3"}  # each in another bra
     "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )
 def test_the_policy_of_step_0_acts_as_the_demonstrations(record, train, monkeypatch, capfd, case):
-    monkeypatch.setattr(demonstrations, "_UPDATES", 800 if case == "crossq" else 300)
+    monkeypatch.setattr(demonstrations, "_UPDATES", 800 if case in ("crossq", "xqc") else 300)
     env, settings = CASES[case]
     run = train(env, settings, demos=str(record(env))).run
     policy = load_policy(run.policy_file("0"))

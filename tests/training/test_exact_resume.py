@@ -104,6 +104,9 @@ CASES = {
     "dqn": ("Discrete", settings("dqn", algo_kwargs={"target_update_interval": 20})),
     "tqc": ("Line", settings("tqc")),
     "crossq": ("Line", settings("crossq")),
+    "xqc": ("Line", settings("xqc")),
+    "xqc, hindsight": ("Plane", settings("xqc", her={}, task={"steps": 7})),
+    "xqc, privileged": (STOOL, settings("xqc", randomize=True, privileged={"task": False})),
     # Minibatches of four blocks, 128 rows * 34,000 weights, and of two, 64 / 32 rows.
     "ppo, blocks": ("Line", settings("ppo", algo_kwargs={"n_steps": 32, "batch_size": 128}, **WIDE)),
     "tqc, blocks": ("Line", settings("tqc", algo_kwargs={"batch_size": 64}, **WIDE)),
@@ -126,7 +129,7 @@ def test_killed_and_resumed(train, resume, kill_after, case):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("case", ["ppo", "recurrent_ppo", "sac", "sac with gSDE", "td3", "dqn", "tqc", "crossq"])
+@pytest.mark.parametrize("case", ["ppo", "recurrent_ppo", "sac", "sac with gSDE", "td3", "dqn", "tqc", "crossq", "xqc"])
 @pytest.mark.usefixtures("every_boundary")
 def test_on_a_gpu(train, resume, kill_after, case):
     kill_and_resume(train, resume, kill_after, case, "cuda")

@@ -63,7 +63,7 @@ def learn(rollouts: OffPolicyRollouts, steps: int):
 @pytest.mark.slow_except("sac-Plane")
 @pytest.mark.parametrize(
     ("algo", "env"),
-    [("sac", "Plane"), ("td3", "Plane"), ("ddpg", "Plane"), ("tqc", "Plane"), ("dqn", "Corridor")],
+    [("sac", "Plane"), ("td3", "Plane"), ("ddpg", "Plane"), ("tqc", "Plane"), ("xqc", "Plane"), ("dqn", "Corridor")],
 )
 def test_algorithms_train_in_hindsight(build, algo, env):
     rollouts = build(env, algo=algo)

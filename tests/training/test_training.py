@@ -121,6 +121,7 @@ def test_kept_episodes_are_the_first_and_the_worst(finished):
         ("dqn", "Discrete"),
         ("tqc", "Line"),
         ("crossq", "Line"),
+        ("xqc", "Line"),
         ("recurrent_ppo", "Line"),
     ],
 )

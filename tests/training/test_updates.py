@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from rlctl.environments.dict_spaces import map_parts, split
 from rlctl.errors import RecipeError
+from rlctl.policy.xqc import XQC
 from rlctl.task.mirror import Mirror
 from rlctl.training.privileged import POLICIES
 from rlctl.training.updates.choice import choose_update
@@ -20,6 +21,7 @@ from rlctl.training.updates.crossq import CrossQUpdate
 from rlctl.training.updates.ppo import PpoUpdate
 from rlctl.training.updates.q_learning import DqnUpdate, Td3Update
 from rlctl.training.updates.sac import SacUpdate, TqcUpdate
+from rlctl.training.updates.xqc import XqcUpdate
 
 pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 
@@ -237,6 +239,16 @@ CROSSQ_CASES = {
     "crossq, no batch normalization": {"network": {"batch_norm": False}},
 }
 OFF_POLICY_CASES |= {name: (CrossQUpdate, CrossQ, case) for name, case in CROSSQ_CASES.items()}
+XQC_CASES = {
+    "xqc": {},
+    "xqc, gSDE, tanh, three critics": {"use_sde": True, "network": {"activation_fn": torch.nn.Tanh, "n_critics": 3}},
+    "xqc, returns outside of the atoms": {"network": {"n_atoms": 11, "v_min": -0.5, "v_max": 0.25}, "ent_coef": 0.2},
+    "xqc, several steps, normalized": {"n_steps": 3, "normalize": True, "policy_delay": 1, "seed": 1},
+    "xqc, dict": {"observations": spaces.Dict({"a": VECTOR, "b": VECTOR}), "policy": "MultiInputPolicy"},
+    "xqc, privileged": {"policy": POLICIES["xqc"], "network": PRIVILEGED, "seed": 2},
+    "xqc, no batch normalization": {"network": {"batch_norm": False}},
+}
+OFF_POLICY_CASES |= {name: (XqcUpdate, XQC, case) for name, case in XQC_CASES.items()}
 OFF_POLICY_CASES |= {
     "td3": (Td3Update, TD3, {"policy_delay": 2}),
     "td3, tanh, three critics": (Td3Update, TD3, {"network": {"activation_fn": torch.nn.Tanh, "n_critics": 3}}),
@@ -272,7 +284,7 @@ WIDE = {"network": {"net_arch": [300, 300]}, "batch_size": 128}
 
 
 @pytest.mark.slow_except("PPO", "TD3")
-@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3, CrossQ])
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, TD3, CrossQ, XQC])
 def test_wide_networks_are_updated_on_all_cores_to_the_same_bit(algorithm, use_cores):
     def train():
         set_random_seed(1)
@@ -296,6 +308,7 @@ def test_what_sb3_updates_itself():
     sac = [make_off_policy(network=elu), make_off_policy(network={"net_arch": []}), make_off_policy(TQC)]
     sac += [make_off_policy(observations=image, policy="CnnPolicy")]
     sac += [make_off_policy(use_sde=True, network={"use_expln": True})]
+    sac += [make_off_policy(XQC, network=elu)]
     assert [choose_update(model) for model in ppo] == ppo
     assert not SacUpdate.supports(sac.pop(2))
     assert [choose_update(model) for model in sac] == sac

@@ -73,14 +73,14 @@ class CrossQGradients(SacGradients):
             )
 
     def _differentiate_critics(self, block: int, rows: slice) -> None:
-        coefficient, with_loss, _ = self._arrays["numbers"].tolist()
+        coefficient, with_loss = np.float32(self._arrays["numbers"][0]), self._arrays["numbers"][1]
         next_features, count = self._take("next_features", rows), self._settings.rows
-        sample = self._actor.sample(next_features, "next", self._take("next_normal", rows))
+        seen = next_features[:, : self._settings.actor[0]]
+        sample = self._actor.sample(seen, "next", self._take("next_normal", rows))
         features = np.concatenate([self._take("features", rows), next_features])
         actions = np.concatenate([self._take("actions", rows), sample.action])
         passed = self._critics.run(np.concatenate([features, actions], 1)[None], "learning")
-        values = passed[-1][:, count:].min(0) - np.float32(coefficient) * sample.log_prob
-        target = self._take("rewards", rows) + self._take("discounts", rows) * values
+        target = self._make_target(passed[-1][:, count:], coefficient * sample.log_prob, rows)
         outputs = passed[-1][:, :count]
         if with_loss:
             self._arrays["sums"][block, CRITIC_LOSS] = self._compute_loss(outputs, target)

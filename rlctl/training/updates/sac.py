@@ -71,6 +71,7 @@ class SacUpdate:
         model, actor = self._model, self._model.actor
         modules, critic = list_actor_modules(actor), list(model.critic.q_networks[0])
         sizes, actions = list_sizes(modules), modules[-1].out_features
+        support = getattr(model.critic, "support", None)
         return SacSettings(
             rows=model.batch_size,
             actions=actions,
@@ -83,6 +84,7 @@ class SacUpdate:
             epsilon=float(actor.action_dist.epsilon),
             mean_limit=float(actor.clip_mean) if actor.use_sde and actor.clip_mean > 0 else None,
             dropped=getattr(model, "top_quantiles_to_drop_per_net", 0) * len(model.critic.q_networks),
+            atoms=None if support is None else (float(support[0]), float(support[-1])),
         )
 
     def _count_blocks(self, settings: SacSettings) -> int:
@@ -141,14 +143,14 @@ class SacUpdate:
             arrays[name][:] = getattr(batch, name)
         self._draw_noise(learns_actor=learns_actor)
         critic_loss = self._differentiate(CRITICS)[CRITIC_LOSS]
-        self._adam[CRITICS].step()
+        self._step(CRITICS)
         if with_loss:
             logged["critic_loss"].append(critic_loss)
         if learns_actor or self.first_update:
             logged["ent_coef"].append(coefficient)
         if learns_actor:
             sums = self._differentiate(ACTOR)
-            self._adam[ACTOR].step()
+            self._step(ACTOR)
             self._update_coefficient(sums[LOG_PROB], logged)
             logged["actor_loss"].append(sums[ACTOR_LOSS])
 
@@ -158,6 +160,9 @@ class SacUpdate:
         self._blocks.add_gradients(self._count, self._parts[phase])
         means: list[float] = (self._arrays["sums"][: self._count].sum(0) / self._model.batch_size).tolist()
         return means
+
+    def _step(self, phase: int) -> None:
+        self._adam[phase].step()
 
     def _draw_noise(self, *, learns_actor: bool) -> None:
         """Draw the numbers that SB3 would draw, from torch's generator."""

@@ -32,6 +32,7 @@ class SacSettings:
     epsilon: float
     mean_limit: float | None
     dropped: int = 0  # TQC: of all critics' quantiles
+    atoms: tuple[float, float] | None = None  # XQC: the first and the last return of the support
 
     def list_critic_shapes(self) -> ArrayShapes:
         """Return the shapes of the critics' parameters, which come first."""
@@ -95,12 +96,11 @@ class SacGradients(BlockWork):
         return self._arrays["normal"] if is_matrix else self._arrays[name][rows]
 
     def _differentiate_critics(self, block: int, rows: slice) -> None:
-        coefficient, with_loss, _ = self._arrays["numbers"].tolist()
+        coefficient, with_loss = np.float32(self._arrays["numbers"][0]), self._arrays["numbers"][1]
         features = self._take("next_features", rows)
         sample = self._actor.sample(features[:, : self._settings.actor[0]], "next", self._take("next_normal", rows))
         estimates = self._targets.run(np.concatenate([features, sample.action], 1)[None], "target")[-1]
-        values = self._choose_estimates(estimates) - np.float32(coefficient) * sample.log_prob
-        target = self._take("rewards", rows) + self._take("discounts", rows) * values
+        target = self._make_target(estimates, coefficient * sample.log_prob, rows)
         inputs = np.concatenate([self._take("features", rows), self._take("actions", rows)], 1)
         passed = self._critics.run(inputs[None], "learning")
         if with_loss:
@@ -119,6 +119,11 @@ class SacGradients(BlockWork):
         to_action = self._critics.input_gradient(passed, to_outputs, features.shape[1]).sum(0)
         to_log_prob = coefficient / self._settings.rows
         self._actor.backpropagate(sample, normal, to_action, to_log_prob, list(self._gradients[block][1]))
+
+    def _make_target(self, outputs: Floats, penalty: Floats, rows: slice) -> Floats:
+        """Return what the critics learn, from the outputs for the next step and the next actions' entropy penalty."""
+        values = self._choose_estimates(outputs) - penalty
+        return self._take("rewards", rows) + self._take("discounts", rows) * values
 
     def _choose_estimates(self, outputs: Floats) -> Floats:
         """Return the target critics' estimates that form the target, shape (batch, estimates)."""
