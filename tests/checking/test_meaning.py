@@ -137,10 +137,10 @@ def test_the_joints_of_an_arm_do_not_move_what_it_pushes(tmp_path):
     assert {name.partition("/")[0] for name in chain.names} == {"arm"}
 
 
-def test_attributes_of_mixed_shapes_are_left_out():
+def test_attributes_of_mixed_shapes_are_read_item_by_item():
     # gym_electric_motor keeps an array of one number next to a number.
     attributes = read_attributes(SimpleNamespace(mixed=[np.zeros(1), 0.5], goal=[0.1, 0.2]))
-    assert list(attributes) == ["self.goal"]
+    assert list(attributes) == ["self.mixed[0]", "self.mixed[1]", "self.goal"]
 
 
 @pytest.mark.slow
