@@ -108,9 +108,10 @@ class MujocoMotors(Body):
         self.parts.active.clear()
 
     def hold_at(self, positions: Array, worlds: WorldIndex | None) -> None:
-        """Let real motors hold these positions of all joints [rad] until the next command: their controllers always act.
+        """Let real motors hold these positions of all joints [rad] until the next command.
 
-        Without it a joint that is placed by a reset would be driven to 0 where physics runs before the first command.
+        Their controllers always act: without it a joint that a reset places would be driven to 0 where physics runs
+        before the first command.
         """
         joints = list(self.parts.real)
         motors, rows = self._motors[joints], ... if worlds is None else worlds
