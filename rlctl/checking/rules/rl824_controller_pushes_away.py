@@ -11,6 +11,7 @@ from rlctl.checking.mujoco_worlds import MujocoStateReader, copy_data, library
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.worlds import Array
+from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
     "RL824",
@@ -42,9 +43,10 @@ def _find_wrong_signs(trials: MujocoTrials) -> Iterator[RuleFinding]:
     plain = trial.play(FIRST_SEED, steps=1)
     positions, speeds, size = trial.find_places()
     stiffness, damping = _measure_physics(trials.reader, trial, plain)
-    for places, what, physics in ((positions, "position", stiffness), (speeds, "speed", damping)):
+    for places, what, physics, own_gain in ((positions, "position", stiffness, 1), (speeds, "speed", damping, 2)):
         if not _measure_answer(trial, plain, places, size).any():
             continue
+        own_answers = _read_own_answers(trial, own_gain)
         wrong: dict[int, float] = {}
         for joint in range(len(trial.joints)):
             answers = _measure_answer(trial, plain, places[[joint]], size)
@@ -53,7 +55,7 @@ def _find_wrong_signs(trials: MujocoTrials) -> Iterator[RuleFinding]:
             if BEYOND * others > np.abs(answers[own]).max(initial=0.0):
                 continue  # no controller of single joints, with their weight perhaps
             for motor in np.flatnonzero(own & (answers != 0)).tolist():
-                force = answers[motor] * trial.motors[motor].gear
+                force = (answers[motor] + own_answers[motor]) * trial.motors[motor].gear
                 if force > BEYOND * physics[joint] + LEAST:
                     wrong[motor] = force
         if wrong and not trial.is_over():
@@ -75,6 +77,15 @@ def _measure_answer(trial: MotorTrial, plain: PlayedMotors, places: NDArray[np.i
         if after is not None:
             answers = np.nan_to_num(after - before) / change
     return answers
+
+
+def _read_own_answers(trial: MotorTrial, gain: int) -> Array:
+    """Return by how much each actuator's own controller adds to its input, per unit of its joint; it may be a spring
+    from the first command on, with the target as a force. Shape (motors,)."""
+    simulation = find_mujoco(trial.instance.env)
+    assert simulation is not None  # it was played
+    own: Array = simulation[0].actuator_biasprm[[motor.number for motor in trial.motors], gain]
+    return own * [motor.gear for motor in trial.motors]
 
 
 def _measure_physics(reader: MujocoStateReader, trial: MotorTrial, plain: PlayedMotors) -> tuple[Array, Array]:
