@@ -32,7 +32,6 @@ TEMPLATE = Path(__file__).with_name("template_walk")
 """Templates of the files that differ from those of an arm."""
 _CONTROL_DT = 0.02  # [s]
 _STEPS = 100  # that it must stand with zero actions
-_STEPS_OF_RANGES = 6_000_000  # of a training whose ranges grow; an A1 succeeds in 82 % after 3, 98 % after 6 million
 _TINY = 1e-3  # [rad], of rounding
 _ENDLESS_FORCE = 20.0  # of weight x leg length
 _WEAK = 0.15  # of weight x leg length
@@ -140,6 +139,13 @@ def _choose_lines(legged: _Legged) -> frozenset[str]:
         f"style_{kind}": bool(legged.clips),
     }
     return frozenset(name for name, is_kept in chosen.items() if is_kept)
+
+
+def _count_steps(legged: _Legged) -> int:
+    """Return the steps of the training."""
+    if legged.motors is not None:
+        return 6_000_000  # whose ranges grow: an A1 succeeds in 82 % after 3 million, in 98 % after 6
+    return 4_000_000 if legged.is_biped else 3_000_000
 
 
 def load_free(model: str, option: str) -> tuple[Path, MujocoBody]:
@@ -376,5 +382,5 @@ def _describe_steps(legged: _Legged) -> dict[str, str]:
         "feet_in_order": write_list("FEET = ", map(write_string, legged.feet)),
         "soles": SourceText(f"[{join_source(write_number(height, '.3f') for height in gait.soles)}]"),
         "aside": write_list("ASIDE = ", [write_string(names[joint]) for joint in gait.aside]),
-        "total_timesteps": f"{_STEPS_OF_RANGES if legged.motors else 4_000_000 if legged.is_biped else 3_000_000:_}",
+        "total_timesteps": f"{_count_steps(legged):_}",
     }
