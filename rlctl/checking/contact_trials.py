@@ -123,9 +123,20 @@ def play_in_mujoco(watched: WatchedWorlds, other: MujocoContacts, actions: str =
 
 def make_contacts(asked: Sequence[int | None], bump: tuple[Link, Link]) -> Iterator[tuple[Any, ...]]:
     """Yield a contact as getContactPoints returns it, if it has the bodies and links that are asked for."""
-    nothing = (0.0, 0.0, 0.0)
     for one, two in (bump, bump[::-1]):
-        given = (one[0], two[0], one[1], two[1])
-        if all(wanted in (None, value) for wanted, value in zip(asked, given, strict=False)):
-            yield (0, *given, nothing, nothing, (0.0, 0.0, 1.0), -1e-3, 10.0, 0.0, nothing, 0.0, nothing)
+        if is_asked(asked, one, two):
+            yield make_contact(one, two, distance=-1e-3, force=10.0)
             return
+
+
+def is_asked(asked: Sequence[int | None], one: Link, two: Link) -> bool:
+    """Say whether a query for bodyA, bodyB, linkIndexA and linkIndexB returns contacts of two links."""
+    given = (one[0], two[0], one[1], two[1])
+    return all(wanted in (None, value) for wanted, value in zip(asked, given, strict=False))
+
+
+def make_contact(one: Link, two: Link, *, distance: float, force: float, friction: float = 0.0) -> tuple[Any, ...]:
+    """Return a contact of two links as getContactPoints does, with a distance [m] and forces [N]."""
+    nothing, up = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    forces = (distance, force, friction, nothing, friction, nothing)
+    return (0, one[0], two[0], one[1], two[1], nothing, nothing, up, *forces)

@@ -1,5 +1,6 @@
 """Values taken apart: actions and observations into numbers, and the attributes that an environment holds."""
 
+import ast
 import collections
 import contextlib
 import copy
@@ -9,7 +10,7 @@ import math
 import random
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -99,13 +100,17 @@ def list_own_classes(author: Any) -> list[type]:
     return [cls for cls in type(author).__mro__ if cls.__module__.partition(".")[0] not in known]
 
 
-def list_source_files(env: Any) -> list[str]:
-    """Return the files that define the classes of an environment's author; one without a source has none."""
+def parse_sources(env: Any) -> dict[str, ast.Module]:
+    """Return the source of the classes of an environment's author, by file; one that cannot be read is left out."""
     files: set[str] = set()
     for cls in list_own_classes(find_author(env)):
         with contextlib.suppress(TypeError):  # of a class in C, or of a module that is not a file
             files.add(str(inspect.getsourcefile(cls)))
-    return sorted(files)
+    parsed: dict[str, ast.Module] = {}
+    for file in sorted(files):
+        with contextlib.suppress(OSError, SyntaxError, ValueError), open(file, encoding="utf-8") as source:
+            parsed[file] = ast.parse(source.read())
+    return parsed
 
 
 def find_batch(env: Any) -> Any:
@@ -142,7 +147,7 @@ class Attribute:
         if self.item is not None:
             whole = self._read_whole()
             items = [*whole[: self.item], value, *whole[self.item + 1 :]]
-            value = type(whole)(*items) if hasattr(whole, "_fields") else type(whole)(items)
+            value = _join_items(whole, items)
         if isinstance(self.owner, dict):
             self.owner[self.key] = value
         else:
@@ -209,7 +214,12 @@ def shape_like(value: Any, numbers: NDArray[np.float64]) -> Any:
         return float(numbers[0])
     parts = np.split(numbers, np.cumsum([np.size(item) for item in value])[:-1])
     items = [shape_like(item, part) for item, part in zip(value, parts, strict=True)]
-    return type(value)(*items) if hasattr(value, "_fields") else type(value)(items)
+    return _join_items(value, items)
+
+
+def _join_items(like: Any, items: Sequence[Any]) -> Any:
+    """Return items in a list or a tuple of the type of another one, which may have named fields."""
+    return type(like)(*items) if hasattr(like, "_fields") else type(like)(items)
 
 
 def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> list[str]:

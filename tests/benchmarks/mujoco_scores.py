@@ -126,7 +126,10 @@ def read_run(folder: Path) -> list[Row]:
     status, recipe = run.status(), run.recipe()
     if status.get("status") != "finished":
         raise RuntimeError(f"{folder}: the training has not finished")
-    command = shlex.join(status["command"]).replace(str(FOLDER.resolve()), "FOLDER")
+    words = list(status["command"])
+    if "-o" in words:  # a folder of this machine
+        words[words.index("-o") + 1] = "FOLDER"
+    command = shlex.join(words)
     tool, version = f"rlctl {recipe.algo}", read_version("rlctl")
     shared = status["task"], tool, version, recipe.seed, recipe.total_timesteps
     return [
@@ -216,7 +219,7 @@ def keep(trained: list[Row]) -> None:
 
 
 def main() -> int:
-    """Train what is missing, keep its evaluations, and write the page and the picture."""
+    """Train, keep the evaluations, and write the page and the picture."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.mujoco_scores", description=__doc__)
     parser.add_argument("environments", nargs="*", help="ids of Gymnasium; default: only write the page")
     parser.add_argument("--tools", nargs="*", default=["rlctl"], choices=["rlctl", *SBX])
@@ -232,6 +235,8 @@ def main() -> int:
         print(f"{environment} {tool} seed {seed}", file=sys.stderr, flush=True)
         keep(train(environment, tool, seed, options.steps))
     rows = read_rows()
+    if not rows:
+        parser.error("nothing was trained so far: name an environment, or --add a finished run")
     write_page(rows)
     draw(rows, PICTURE)
     return 0

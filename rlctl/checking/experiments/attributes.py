@@ -29,7 +29,7 @@ from rlctl.checking.values import (
     find_numbers,
     flatten_action,
     list_own_classes,
-    list_source_files,
+    parse_sources,
     read_attributes,
 )
 from rlctl.checking.worlds import JOINTS, World
@@ -252,9 +252,7 @@ def _is_number(value: Any) -> bool:
 def _find_literals(env: Any) -> set[float]:
     """Return the numbers that the source of its classes' modules has."""
     found: set[float] = set()
-    for file in list_source_files(env):
-        with contextlib.suppress(OSError, SyntaxError, ValueError):
-            with open(file, encoding="utf-8") as source:
-                values = [node.value for node in ast.walk(ast.parse(source.read())) if isinstance(node, ast.Constant)]
-            found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
+    for tree in parse_sources(env).values():
+        values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+        found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found

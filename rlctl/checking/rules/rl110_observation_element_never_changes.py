@@ -39,8 +39,8 @@ def _find_constant_elements(records: Records) -> Iterator[RuleFinding]:
         rows = read_rows(records, index)
         constant = _constant(rows, leaf)
         total += rows.shape[1]
-        is_whole = len(constant) == rows.shape[1]
-        has_constant_leaf |= is_whole and np.dtype(leaf.dtype).kind == "f" and not _is_counter(rows)
+        is_constant = len(constant) == rows.shape[1]
+        has_constant_leaf |= is_constant and np.dtype(leaf.dtype).kind == "f" and not _is_counter(rows)
         names += [f"{built.element(index, int(column))} ({float(rows[0, column]):.4g})" for column in constant]
     if names:
         message = f"{len(names)} of {total} elements of the observation never changed: {list_names(names)}"

@@ -1,7 +1,6 @@
 """RL126: degrees in a function of radians."""
 
 import ast
-import contextlib
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -10,7 +9,7 @@ from rlctl.checking.experiments.attributes import find_declared_numbers
 from rlctl.checking.experiments.build import judges_built
 from rlctl.checking.instance import Instance
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.checking.values import find_author, list_own_classes, list_source_files
+from rlctl.checking.values import find_author, list_own_classes, parse_sources
 
 RULE = Rule(
     "RL126",
@@ -36,17 +35,14 @@ def _find_degrees(instance: Instance) -> Iterator[RuleFinding]:
     classes = list_own_classes(find_author(instance.env))
     declared = find_declared_numbers(instance.env)
     names = {cls.__name__ for cls in classes}
-    for file in list_source_files(instance.env):
-        with contextlib.suppress(OSError, SyntaxError, ValueError):
-            with open(file, encoding="utf-8") as source:
-                tree = ast.parse(source.read())
-            for call, name, value in _list_calls(tree, names, declared):
-                text = ast.unparse(call)
-                shown = text if name is None else f"{text}, with {name} = {value:g},"
-                message = f"{shown} takes {value:g} radians, which is more than a whole turn, and the same as"
-                message += f" {math.degrees(value % TURN):.3g} degrees"
-                yield RuleFinding(RULE, message, {"element": text, "value": value}, where=(file, call.lineno))
-                return
+    for file, tree in parse_sources(instance.env).items():
+        for call, name, value in _list_calls(tree, names, declared):
+            text = ast.unparse(call)
+            shown = text if name is None else f"{text}, with {name} = {value:g},"
+            message = f"{shown} takes {value:g} radians, which is more than a whole turn, and the same as"
+            message += f" {math.degrees(value % TURN):.3g} degrees"
+            yield RuleFinding(RULE, message, {"element": text, "value": value}, where=(file, call.lineno))
+            return
 
 
 def _list_calls(

@@ -180,8 +180,7 @@ def _judge_passes(
 
 def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> tuple[float, str] | None:
     """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
-    times pi - |e|, where its cosine and sine are observed, or a
-    vector in its direction. None if it does not."""
+    times pi - |e|, where its cosine and sine are observed, or a vector in its direction. None if it does not."""
     for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
         room = np.pi - np.abs(_angle(steps.after, cosine, sine))
         rows = jumps.is_jump & (room > LEAST_ROOM)

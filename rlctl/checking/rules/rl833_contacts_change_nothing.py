@@ -1,6 +1,7 @@
 """RL833: contacts change nothing."""
 
 import dataclasses
+import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking import contact_trials
-from rlctl.checking.contact_trials import PlayedContacts, play_in_bullet
+from rlctl.checking.contact_trials import PlayedContacts, is_asked, make_contact, play_in_bullet
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.instance import EnvironmentRaised
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
@@ -109,20 +110,12 @@ def _list_queries(watched: WatchedWorlds, world: LoggedWorld) -> dict[Asked, Con
 
 def _list_contacts(world: LoggedWorld, asked: Asked, read: set[int]) -> Iterator[_Contact]:
     """Yield a contact of each pair of links that a query asks for; `read` gets the fields that are read."""
-    one, two, link_of_one, link_of_two = asked
-    nothing = (0.0, 0.0, 0.0)
-    for body in world.world.bodies:
-        for other in world.world.bodies:
-            if body.id == other.id or one not in (None, body.id) or two not in (None, other.id):
-                continue
-            for link in range(-1, len(body.links) - 1):
-                for other_link in range(-1, len(other.links) - 1):
-                    if link_of_one in (None, link) and link_of_two in (None, other_link):
-                        forces = (DISTANCE, FORCE, FORCE, nothing, FORCE, nothing)
-                        places = (nothing, nothing, (0.0, 0.0, 1.0))
-                        contact = _Contact((0, body.id, other.id, link, other_link, *places, *forces))
-                        contact.read = read
-                        yield contact
+    links = [(body.id, link) for body in world.world.bodies for link in range(-1, len(body.links) - 1)]
+    for one, two in itertools.permutations(links, 2):
+        if one[0] != two[0] and is_asked(asked, one, two):
+            contact = _Contact(make_contact(one, two, distance=DISTANCE, force=FORCE, friction=FORCE))
+            contact.read = read
+            yield contact
 
 
 def _is_ignored(watched: WatchedWorlds, world: LoggedWorld, key: Asked, fakes: Mapping[Asked, Contacts]) -> bool:

@@ -114,14 +114,10 @@ class MujocoMotors(Body):
         before the first command.
         """
         joints = list(self.parts.real)
-        motors, rows = self._motors[joints], ... if worlds is None else worlds
-        gains = self._fields.model("actuator_gainprm")[rows][..., motors, STIFFNESS]
-        targets = np.asarray(positions)[..., joints]
-        controls = np.where(self._real.has_integral[joints], targets, gains * targets)
-        if worlds is None:
-            self._fields.data("ctrl")[..., motors] = controls
-        else:
-            self._fields.data("ctrl")[worlds[:, None], motors] = controls
+        rows: Any = ... if worlds is None else worlds[:, None]
+        motors, targets = self._motors[joints], np.asarray(positions)[..., joints]
+        gains = self._fields.model("actuator_gainprm")[rows, motors, STIFFNESS]
+        self._fields.data("ctrl")[rows, motors] = np.where(self._real.has_integral[joints], targets, gains * targets)
 
     @property
     def joint_torques(self) -> Array:
