@@ -93,16 +93,23 @@ def is_gymnasium_id(task: str) -> bool:
 def find_recipe_file(task: str) -> Path | None:
     """Return the recipe that comes with a task: `<name>.yaml` next to its module, or `<file>.yaml` next to its file.
 
-    That of a Gymnasium id is the preset of its name, such as `presets/ant-v5`.
+    That of a Gymnasium id is the preset of its name, such as `presets/ant-v5`, or of another version of that name.
     """
     if entry := installed.find(task):
         return entry.recipe_file
     if _GYMNASIUM_ID.match(task):
-        preset = PRESETS / f"{task.lower()}.yaml"
-        return preset if preset.is_file() else None
+        return _find_preset(task.lower())
     file = find_source_file(task)
     recipe = file.with_suffix(".yaml") if file else None
     return recipe if recipe and recipe.is_file() else None
+
+
+def _find_preset(task: str) -> Path | None:
+    preset = PRESETS / f"{task}.yaml"
+    if preset.is_file():
+        return preset
+    name, dash, _ = task.rpartition("-v")
+    return max(PRESETS.glob(f"{name}-v*.yaml"), default=None) if dash else None
 
 
 def find_source_file(task: str) -> Path | None:

@@ -33,6 +33,7 @@ def test_the_example_of_the_page_about_mujoco():
 def test_a_gymnasium_id_has_the_preset_of_its_name():
     assert sources.resolve("Reacher-v5", None, {}) == sources.resolve("Reacher-v5", Path("presets/reacher-v5"), {})
     assert sources.resolve("Reacher-v5", Path("presets/sac"), {}).algo == "sac"
+    assert sources.resolve("Reacher-v4", None, {}) == sources.resolve("Reacher-v5", None, {})  # another version
     assert sources.resolve("Pendulum-v1", None, {}) == sources.resolve("CartPole-v1", None, {})  # nobody's preset
 
 

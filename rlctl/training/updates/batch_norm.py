@@ -2,6 +2,10 @@
 
 S. Ioffe, Batch Renormalization, 2017, https://arxiv.org/abs/1702.03275, as in sb3-contrib: for `warmup_steps` batch
 normalization, then with limits of the correction that do not change.
+
+Normalization and linear layer are one product: the weights contain the factors, the bias the means. The gradients of
+both follow from the product of the outputs' gradient and the inputs, which is as large as the weights. So only the
+statistics, and their part of the inputs' gradient, need arrays as large as the batch.
 """
 
 import dataclasses
@@ -18,14 +22,19 @@ from rlctl.training.updates.perceptrons import Floats, MlpStack
 
 @dataclasses.dataclass(frozen=True)
 class _Normalized:
-    """Inputs of a layer, shape (networks, batch, size), and how they were normalized; the rest (networks, 1, size)."""
+    """Inputs of a layer, shape (networks, batch, size), and how they are normalized; the rest (networks, 1, size)."""
 
-    centered: Floats  # minus their mean
-    factor: Floats  # normalized = centered * factor + shift, before the layer's own scale and bias
+    inputs: Floats
+    mean: Floats
+    factor: Floats  # normalized = (inputs - mean) * factor + shift, before the layer's own scale and bias
     shift: Floats
     # Derivatives of the variance that normalizes, and of the mean, by the batch's variance; None without learning.
     var_by_var: Floats | None = None
     mean_by_var: Floats | None = None
+
+    def center(self) -> "_Normalized":
+        """Subtract the mean from the inputs, so that large ones are not rounded."""
+        return dataclasses.replace(self, inputs=self.inputs - self.mean, mean=np.zeros_like(self.mean))
 
 
 class _Renorm:
@@ -35,27 +44,26 @@ class _Renorm:
         self._layers, self._settings = layers, layers[0]
         self._eps = np.float32(layers[0].eps)
         scales, biases = [layer.scale for layer in layers], [layer.bias for layer in layers]
-        self.scale, self._bias = (share(values).numpy()[:, None] for values in (scales, biases))
+        self._scale, self._bias = (share(values).numpy()[:, None] for values in (scales, biases))
         self._scale_gradient, self._bias_gradient = (share_gradients(values)[:, None] for values in (scales, biases))
         names = ("ra_mean", "ra_var")
         self._mean, self._var = (share([getattr(layer, name) for layer in layers]).numpy()[:, None] for name in names)
 
-    def run(self, inputs: Floats, *, learns: bool) -> tuple[Floats, _Normalized]:
-        """Return the layers' outputs; with `learns` by the statistics of the batch, which change the running ones."""
-        if learns:
-            normalized = self._learn(inputs)
-        else:
-            factor: Floats = np.reciprocal(np.sqrt(self._var + self._eps))
-            normalized = _Normalized(inputs - self._mean, factor, np.zeros_like(factor))
-        outputs = normalized.centered * (normalized.factor * self.scale)
-        outputs += normalized.shift * self.scale + self._bias
-        return outputs, normalized
+    def find_line(self, normalized: _Normalized) -> tuple[Floats, Floats]:
+        """Return factor and offset of the layers' outputs: (inputs - mean) * factor + offset."""
+        return normalized.factor * self._scale, normalized.shift * self._scale + self._bias
 
-    def _learn(self, inputs: Floats) -> _Normalized:
+    def normalize(self, inputs: Floats) -> _Normalized:
+        """Use the running statistics."""
+        factor: Floats = np.reciprocal(np.sqrt(self._var + self._eps))
+        return _Normalized(inputs, self._mean.copy(), factor, np.zeros_like(factor))
+
+    def learn(self, inputs: Floats) -> _Normalized:
+        """Use the statistics of the batch, which change the running ones."""
         settings, count = self._settings, inputs.shape[1]
         mean = _sum(inputs) / np.float32(count)
-        centered = inputs - mean
-        var = _sum(np.square(centered)) / np.float32(count - 1)
+        squares = inputs - mean
+        var = _sum(np.square(squares, out=squares)) / np.float32(count - 1)
         ratio, shift = np.ones_like(self._var), np.zeros_like(self._mean)
         if int(settings.steps) > settings.warmup_steps:
             running = np.sqrt(self._var + self._eps)
@@ -70,23 +78,29 @@ class _Renorm:
         deviation = np.sqrt(var)
         away = shift * deviation / ratio
         by_var = np.divide(-0.5 * shift, ratio * deviation, out=np.zeros_like(factor), where=deviation > 0)
-        return _Normalized(centered, factor, away * factor, 1 / np.square(ratio), by_var)
+        return _Normalized(inputs, mean, factor, away * factor, 1 / np.square(ratio), by_var)
 
-    def backpropagate(self, normalized: _Normalized, gradient: Floats) -> Floats:
-        """Set the gradients of scale and bias from the outputs' gradient; return that of the inputs."""
-        total, product = _sum(gradient), _sum(gradient * normalized.centered)
+    def backpropagate(self, normalized: _Normalized, total: Floats, product: Floats) -> tuple[Floats, Floats] | None:
+        """Set the gradients of scale and bias.
+
+        Args:
+            normalized: how the inputs were normalized.
+            total: of the outputs' gradient, the sum over the batch; shape (networks, 1, size).
+            product: the sum of the gradient times (inputs - mean).
+
+        Returns:
+            Slope and offset of what the statistics add to the inputs' gradient, as a function of (inputs - mean); None
+            if they are not the batch's.
+        """
         self._bias_gradient[...] = total
         self._scale_gradient[...] = product * normalized.factor + total * normalized.shift
-        factor = normalized.factor * self.scale
-        to_inputs: Floats = gradient * factor
-        if normalized.var_by_var is not None and normalized.mean_by_var is not None:
-            count = np.float32(gradient.shape[1])
-            to_mean = -factor * total
-            to_var = np.square(normalized.factor) * self.scale * self._scale_gradient * -0.5 * normalized.var_by_var
-            to_var += to_mean * normalized.mean_by_var
-            to_inputs += normalized.centered * (to_var * (2 / (count - 1)))
-            to_inputs += to_mean / count
-        return to_inputs
+        if normalized.var_by_var is None or normalized.mean_by_var is None:
+            return None
+        count = np.float32(normalized.inputs.shape[1])
+        to_mean = -normalized.factor * self._scale * total
+        to_var = np.square(normalized.factor) * self._scale * self._scale_gradient * -0.5 * normalized.var_by_var
+        to_var += to_mean * normalized.mean_by_var
+        return to_var * (2 / (count - 1)), to_mean / count
 
 
 def _sum(values: Floats) -> Floats:
@@ -95,11 +109,12 @@ def _sum(values: Floats) -> Floats:
 
 
 class _Passed(list[Floats]):
-    """The inputs, then for each layer its normalized inputs and its output."""
+    """The inputs and the output of each layer."""
 
     def __init__(self, inputs: Floats) -> None:
         super().__init__([inputs])
         self.normalized: list[_Normalized] = []
+        self.weights: list[Floats] = []  # those that contain the factors
 
 
 def is_normalized(modules: Iterable[nn.Module]) -> bool:
@@ -123,38 +138,65 @@ class NormalizedMlpStack(MlpStack):
         self._norms = [_Renorm(row) for row in zip(*norms, strict=True)]
 
     def run(self, inputs: Floats, use: str) -> list[Floats]:
-        """Return the inputs, and for each layer its normalized inputs and its output."""
+        """As `MlpStack.run`."""
         values = _Passed(inputs)
         outputs = self._get_buffers(use, inputs.shape[1])
         for index, norm in enumerate(self._norms):
-            inputs, normalized = norm.run(values[-1], learns=use == "learning")
-            self._run_layer(index, inputs, outputs[index])
-            values += [inputs, outputs[index]]
+            normalized = (norm.learn if use == "learning" else norm.normalize)(values[-1])
+            if index == 0:  # observations can be large, and vary little
+                normalized = normalized.center()
+            factor, offset = norm.find_line(normalized)
+            weight = self._weights[index] * factor
+            transposed = self._weights[index].swapaxes(1, 2)
+            bias = self._biases[index] + (offset - normalized.mean * factor) @ transposed
+            self._run_layer(index, normalized.inputs, outputs[index], weight, bias)
+            values.append(outputs[index])
             values.normalized.append(normalized)
+            values.weights.append(weight)
         return values
+
+    def read_latent(self, values: list[Floats]) -> Floats:
+        """As `MlpStack.read_latent`: the normalized ones."""
+        assert isinstance(values, _Passed)
+        normalized = values.normalized[-1]
+        factor, offset = self._norms[-1].find_line(normalized)
+        return (normalized.inputs - normalized.mean) * factor + offset
 
     def backpropagate(
         self, values: list[Floats], gradient: Floats, gradients: Sequence[Floats], *, latent: Floats | None = None
     ) -> None:
         """As `MlpStack.backpropagate`; `latent` is the gradient of the last layer's normalized inputs."""
         assert isinstance(values, _Passed)
+        hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(len(self._weights))):
-            self._set_gradients(values[2 * index + 1], gradient, gradients[2 * index : 2 * index + 2])
-            gradient = gradient @ self._weights[index]
+            normalized, weight, norm = values.normalized[index], self._weights[index], self._norms[index]
+            factor, offset = norm.find_line(normalized)
+            to_weight, to_bias = gradients[2 * index : 2 * index + 2]
+            self._set_gradients(normalized.inputs, gradient, (to_weight, to_bias))
+            sums = to_bias.swapaxes(1, 2)
+            to_weight -= sums * normalized.mean
+            total, product = to_bias @ weight, (weight * to_weight).sum(1, keepdims=True)
+            to_weight *= factor
+            to_weight += sums * offset
             if latent is not None:
-                gradient += latent
+                total += _sum(latent)
+                product += _sum(latent * (normalized.inputs - normalized.mean))
+            line = norm.backpropagate(normalized, total, product)
+            if index == 0:
+                return
+            gradient = np.matmul(gradient, values.weights[index], out=hidden[index - 1])
+            if latent is not None:
+                gradient += latent * factor
                 latent = None
-            gradient = self._norms[index].backpropagate(values.normalized[index], gradient)
-            if index > 0:
-                self._derive(gradient, values[2 * index])
+            if line is not None:
+                gradient += normalized.inputs * line[0]
+                gradient += line[1] - normalized.mean * line[0]
+            self._derive(gradient, values[index])
 
     def input_gradient(self, values: list[Floats], gradient: Floats, first: int) -> Floats:
         """Return the gradient of inputs `first` and later, of a run by the running statistics."""
         assert isinstance(values, _Passed)
-        for index in reversed(range(len(self._weights))):
-            begin = 0 if index else first
-            gradient = gradient @ self._weights[index][:, :, begin:]
-            gradient *= (values.normalized[index].factor * self._norms[index].scale)[:, :, begin:]
-            if index > 0:
-                self._derive(gradient, values[2 * index])
-        return gradient
+        for index in reversed(range(1, len(self._weights))):
+            gradient = gradient @ values.weights[index]
+            self._derive(gradient, values[index])
+        return gradient @ values.weights[0][:, :, first:]

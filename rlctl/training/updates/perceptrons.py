@@ -64,12 +64,16 @@ class MlpStack:
         """Return the inputs and the output of each layer. The next run with the same `use` overwrites these arrays."""
         values = [inputs, *self._get_buffers(use, inputs.shape[1])]
         for index in range(len(self._weights)):
-            self._run_layer(index, values[index], values[index + 1])
+            self._run_layer(index, values[index], values[index + 1], self._weights[index], self._biases[index])
         return values
 
-    def _run_layer(self, index: int, inputs: Floats, output: Floats) -> None:
-        np.matmul(inputs, self._weights[index].swapaxes(1, 2), out=output)
-        output += self._biases[index]
+    def read_latent(self, values: list[Floats]) -> Floats:
+        """Return the inputs of the last layer."""
+        return values[-2]
+
+    def _run_layer(self, index: int, inputs: Floats, output: Floats, weight: Floats, bias: Floats) -> None:
+        np.matmul(inputs, weight.swapaxes(1, 2), out=output)
+        output += bias
         is_hidden = index + 1 < len(self._weights)
         if is_hidden and self._uses_tanh:
             np.tanh(output, out=output)

@@ -32,8 +32,9 @@ class SquashedGaussian:
     def sample(self, features: Floats, use: str, normal: Floats) -> Sample:
         """Draw actions; `normal`: standard normal numbers, or gSDE's noise matrix."""
         values = self.network.run(features[None], use)
-        latent, mean = values[-2][0], values[-1][0, :, : self._count]
+        mean = values[-1][0, :, : self._count]
         if self._log_std is not None:
+            latent = self.network.read_latent(values)[0]
             if self._mean_limit is not None:
                 mean = mean.clip(-self._mean_limit, self._mean_limit)
             noise = latent @ normal
@@ -76,7 +77,7 @@ class SquashedGaussian:
         # noise = latent @ matrix, where matrix = exp(log_std) * normal numbers, and
         # std^2 = latent^2 @ exp(2 log_std) + epsilon.
         assert self._log_std is not None
-        latent, variances = sample.values[-2][0], np.exp(2 * self._log_std)
+        latent, variances = self.network.read_latent(sample.values)[0], np.exp(2 * self._log_std)
         precision = np.reciprocal(np.square(sample.std))
         to_noise = to_mean - sample.noise * precision * np.float32(to_log_prob)
         to_variance = (np.square(sample.noise) * precision - 1) * precision * np.float32(0.5 * to_log_prob)
