@@ -54,6 +54,27 @@ PUBLISHED = {  # return on v4 after `BUDGETS`: means of ten seeds, from the curv
         "Humanoid": (5636, 10284),
         "Walker2d": (4800, 6423),
     },
+    "DroQ": {
+        "Ant": (3814, 5965),
+        "HalfCheetah": (8735, 11070),
+        "Hopper": (2607, 2798),
+        "Humanoid": (3404, 5380),
+        "Walker2d": (3848, 4782),
+    },
+    "MR.Q": {
+        "Ant": (4224, 6809),
+        "HalfCheetah": (9981, 13018),
+        "Hopper": (2462, 2544),
+        "Humanoid": (1309, 10129),
+        "Walker2d": (4137, 5896),
+    },
+    "BRO": {
+        "Ant": (4144, 7467),
+        "HalfCheetah": (9772, 15420),
+        "Hopper": (1770, 1802),
+        "Humanoid": (983, 5681),
+        "Walker2d": (629, 3036),
+    },
     "SimBaV2": {
         "Ant": (5732, 7429),
         "HalfCheetah": (8913, 12022),

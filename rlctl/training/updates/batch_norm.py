@@ -167,12 +167,13 @@ class NormalizedMlpStack(MlpStack):
     ) -> None:
         """As `MlpStack.backpropagate`; `latent` is the gradient of the last layer's normalized inputs."""
         assert isinstance(values, _Passed)
-        hidden = self._get_buffers("gradients", gradient.shape[1])
+        hidden = self._get_buffers("gradients", len(values[0][0]))
         for index in reversed(range(len(self._weights))):
+            rows = gradient.shape[1]
             normalized, weight, norm = values.normalized[index], self._weights[index], self._norms[index]
             factor, offset = norm.find_line(normalized)
             to_weight, to_bias = gradients[2 * index : 2 * index + 2]
-            self._set_gradients(normalized.inputs, gradient, (to_weight, to_bias))
+            self._set_gradients(normalized.inputs[:, :rows], gradient, (to_weight, to_bias))
             sums = to_bias.swapaxes(1, 2)
             to_weight -= sums * normalized.mean
             total, product = to_bias @ weight, (weight * to_weight).sum(1, keepdims=True)
@@ -184,7 +185,9 @@ class NormalizedMlpStack(MlpStack):
             line = norm.backpropagate(normalized, total, product)
             if index == 0:
                 return
-            gradient = np.matmul(gradient, values.weights[index], out=hidden[index - 1])
+            np.matmul(gradient, values.weights[index], out=hidden[index - 1][:, :rows])
+            gradient = hidden[index - 1]
+            gradient[:, rows:] = 0
             if latent is not None:
                 gradient += latent * factor
                 latent = None

@@ -84,9 +84,7 @@ class CrossQGradients(SacGradients):
         outputs = passed[-1][:, :count]
         if with_loss:
             self._arrays["sums"][block, CRITIC_LOSS] = self._compute_loss(outputs, target)
-        to_outputs = np.zeros_like(passed[-1])
-        to_outputs[:, :count] = self._differentiate_loss(outputs, target)
-        self._critics.backpropagate(passed, to_outputs, self._gradients[block][0])
+        self._critics.backpropagate(passed, self._differentiate_loss(outputs, target), self._gradients[block][0])
 
 
 class CrossQUpdate(SacUpdate):

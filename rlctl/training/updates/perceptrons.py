@@ -91,8 +91,9 @@ class MlpStack:
     ) -> None:
         """Set `gradients` of the parameters from the outputs' gradient, and from `latent`, of the last hidden layer.
 
-        Overwrites the hidden layers in `values`, which `run` returned.
+        Overwrites the hidden layers in `values`, which `run` returned; rows after those of `gradient` have none.
         """
+        values = [value[:, : gradient.shape[1]] for value in values]
         hidden = self._get_buffers("gradients", gradient.shape[1])
         for index in reversed(range(1, len(self._weights))):
             self._set_gradients(values[index], gradient, gradients[2 * index : 2 * index + 2])
