@@ -72,6 +72,8 @@ ROWS = {
     "sbx-tqc-128": "sbx:tqc_128",
     "sbx-sac-128": "sbx:sac_128",
     "sbx-sac-256": "sbx:sac_256",
+    "sbx-sac-mujoco": "sbx:sac_mujoco",
+    "sbx-crossq-mujoco": "sbx:crossq_mujoco",
     "learner-ppo": "learner:ppo",
     "learner-tqc": "learner:tqc",
     "memory": "memory:per_environment",

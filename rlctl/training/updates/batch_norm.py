@@ -148,7 +148,7 @@ class NormalizedMlpStack(MlpStack):
             factor, offset = norm.find_line(normalized)
             weight = self._weights[index] * factor
             transposed = self._weights[index].swapaxes(1, 2)
-            bias = self._biases[index] + (offset - normalized.mean * factor) @ transposed
+            bias: Floats = self._biases[index] + (offset - normalized.mean * factor) @ transposed
             self._run_layer(index, normalized.inputs, outputs[index], weight, bias)
             values.append(outputs[index])
             values.normalized.append(normalized)
