@@ -146,9 +146,9 @@ class NormalizedMlpStack(MlpStack):
             if index == 0:  # observations can be large, and vary little
                 normalized = normalized.center()
             factor, offset = norm.find_line(normalized)
-            weight = self._weights[index] * factor
-            transposed = self._weights[index].swapaxes(1, 2)
-            bias: Floats = self._biases[index] + (offset - normalized.mean * factor) @ transposed
+            weight: Floats = self._weights[index] * factor
+            bias: Floats = (offset - normalized.mean * factor) @ self._weights[index].swapaxes(1, 2)
+            bias += self._biases[index]
             self._run_layer(index, normalized.inputs, outputs[index], weight, bias)
             values.append(outputs[index])
             values.normalized.append(normalized)
