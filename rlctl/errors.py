@@ -213,7 +213,7 @@ def check_name(
 ) -> None:
     """Raise `error` if a name is unknown: `no_such`, the name, the closest known name, all known names."""
     if name not in (names := list(known)):
-        known_names = short_repr(", ".join(names) or none, 200)
+        known_names = short_repr(", ".join(names) or none, 300)
         raise error(f"{no_such} {short_repr(name)!r}.{did_you_mean(str(name), names)} {listed}: {known_names}.")
 
 

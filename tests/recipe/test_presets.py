@@ -37,12 +37,21 @@ def test_a_gymnasium_id_has_the_preset_of_its_name():
     assert sources.resolve("Pendulum-v1", None, {}) == sources.resolve("CartPole-v1", None, {})  # nobody's preset
 
 
+@pytest.mark.parametrize("robot", ["Ant", "HalfCheetah", "Hopper", "Humanoid", "Walker2d"])
+def test_gymnasium_s_robots_learn_off_policy(robot):
+    for version in ("v4", "v5"):
+        made = sources.resolve(f"{robot}-{version}", None, {})
+        assert (made.algo in ("xqc", "crossq"), made.n_envs, made.total_timesteps) == (True, 1, 200_000)
+
+
 def test_a_preset_that_is_not_there():
     with pytest.raises(ArtifactError) as caught:
         sources.resolve("reach", Path("presets/pppo"), {})
     assert str(caught.value) == (
         "no preset 'presets/pppo'. Did you mean 'presets/ppo'? "
-        "Presets: presets/biped-ladder, presets/gear-arm-ladder, presets/ppo, presets/reacher-v5, presets/sac."
+        "Presets: presets/ant-v5, presets/biped-ladder, presets/gear-arm-ladder, presets/halfcheetah-v5, "
+        "presets/hopper-v5, presets/humanoid-v5, presets/ppo, presets/reacher-v5, presets/sac, presets/walker2d-v5, "
+        "presets/xqc."
     )
 
 
