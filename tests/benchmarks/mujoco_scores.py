@@ -24,6 +24,8 @@ from typing import Any
 import numpy as np
 
 from rlctl.errors import RlctlError
+from rlctl.recipe import sources
+from rlctl.recipe.recipe import Recipe
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.runs.compare.significance import interquartile_mean_interval
 from rlctl.runs.directory import RunDirectory
@@ -147,16 +149,24 @@ def read_run(folder: Path) -> list[Row]:
     status, recipe = run.status(), run.recipe()
     if status.get("status") != "finished":
         raise RuntimeError(f"{folder}: the training has not finished")
-    words = list(status["command"])
-    if "-o" in words:  # a folder of this machine
-        words[words.index("-o") + 1] = "FOLDER"
-    command = shlex.join(words)
+    command = _describe_command(status, recipe)
     tool, version = f"rlctl {recipe.algo}", read_version("rlctl")
     shared = status["task"], tool, version, recipe.seed, recipe.total_timesteps
     return [
         Row(*shared, int(row["steps"]), round(float(row["return"]), 1), round(float(row["seconds"]) / 60, 2), command)
         for row in read_csv(run.evals_file)
     ]
+
+
+def _describe_command(status: dict[str, Any], recipe: Recipe) -> str:
+    """Return the command without folders of this machine, and without a file that says what the preset says."""
+    if recipe == sources.resolve(status["task"], None, {"seed": recipe.seed}):
+        return f"rlctl train {status['task']} --seed {recipe.seed}"
+    words = list(status["command"])
+    for option, shown in (("-o", "FOLDER"), ("--resume", "FOLDER"), ("--config", "FILE")):
+        if option in words:
+            words[words.index(option) + 1] = shown
+    return shlex.join(words)
 
 
 def write_page(rows: list[Row]) -> None:
