@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from rlctl.errors import RlctlError
+from rlctl.evaluation.episode_statistics import Spread
 from rlctl.recipe import sources
 from rlctl.recipe.recipe import Recipe
-from rlctl.evaluation.episode_statistics import Spread
 from rlctl.runs.compare.significance import interquartile_mean_interval
 from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
