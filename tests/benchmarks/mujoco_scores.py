@@ -3,7 +3,8 @@
 `python -m tests.benchmarks.mujoco_scores Ant-v5 --tools rlctl "sbx CrossQ" --seeds 0 1 --steps 200000`
 
 One training runs at a time, with all cores. Every evaluation is a row of docs/mujoco-scores.csv, which is kept: the
-page and its picture are written from all of it. `--add RUN ...` takes finished runs of rlctl instead of training.
+page and its picture are written from all of it. `--add RUN ...` takes finished runs of rlctl instead of training, for
+example two that ran side by side with a core each (`--cores 1`).
 trainers.py says what sbx needs.
 """
 
@@ -25,6 +26,7 @@ import numpy as np
 
 from rlctl.errors import RlctlError
 from rlctl.evaluation.episode_statistics import Spread
+from rlctl.play.workers import available_cores
 from rlctl.recipe import sources
 from rlctl.recipe.recipe import Recipe
 from rlctl.runs.compare.significance import interquartile_mean_interval
@@ -107,12 +109,13 @@ class Row:
     steps: int
     score: float  # mean return of the evaluation
     minutes: float  # from the start of the training
+    cores: int  # that the training had
     command: str
 
     @classmethod
     def read(cls, row: dict[str, str]) -> Row:
         """Read a row of the file."""
-        numbers = {"seed": int, "budget": int, "steps": int, "score": float, "minutes": float}
+        numbers = {"seed": int, "budget": int, "steps": int, "score": float, "minutes": float, "cores": int}
         return cls(**{name: numbers.get(name, str)(value) for name, value in row.items()})
 
     @property
@@ -131,19 +134,19 @@ def train(environment: str, tool: str, seed: int, budget: int) -> list[Row]:
         settings = {"total_timesteps": budget, "eval.every_steps": EVERY, "eval.episodes": EPISODES}
         command += itertools.chain.from_iterable(("--set", f"{key}={value}") for key, value in settings.items())
         follow(command, list, folder / "log.txt", np.inf)
-        return read_run(folder / "latest")
+        return read_run(folder / "latest", available_cores())
     job = {"env": environment, "seed": seed, "steps": budget, "n_envs": 1, "every": EVERY, "folder": str(folder)}
     command = write_sbx(job | {"episodes": EPISODES} | SBX[tool], folder)
     evaluations = follow(command, lambda: read_evaluations(folder), folder / "log.txt", np.inf)
     shared = environment, tool, read_version("sbx"), seed, budget
     shown = describe_command(command, folder)
     return [
-        Row(*shared, EVERY * number, round(score, 1), round(minutes, 2), shown)
+        Row(*shared, EVERY * number, round(score, 1), round(minutes, 2), available_cores(), shown)
         for number, (minutes, score) in enumerate(evaluations, start=1)
     ]
 
 
-def read_run(folder: Path) -> list[Row]:
+def read_run(folder: Path, cores: int) -> list[Row]:
     """Return the evaluations of a run of rlctl; raises `RuntimeError` unless it has finished."""
     run = RunDirectory(folder)
     status, recipe = run.status(), run.recipe()
@@ -153,7 +156,10 @@ def read_run(folder: Path) -> list[Row]:
     tool, version = f"rlctl {recipe.algo}", read_version("rlctl")
     shared = status["task"], tool, version, recipe.seed, recipe.total_timesteps
     return [
-        Row(*shared, int(row["steps"]), round(float(row["return"]), 1), round(float(row["seconds"]) / 60, 2), command)
+        Row(
+            *(*shared, int(row["steps"]), round(float(row["return"]), 1)),
+            *(round(float(row["seconds"]) / 60, 2), cores, command),
+        )
         for row in read_csv(run.evals_file)
     ]
 
@@ -183,8 +189,8 @@ def write_page(rows: list[Row]) -> None:
     for budget in BUDGETS:
         lines += [
             f"\n## {budget:,} steps\n",
-            "| robot | trained by | seeds | return | of each seed | minutes |",
-            "|---|---|---|---|---|---|",
+            "| robot | trained by | seeds | return | of each seed | minutes | cores |",
+            "|---|---|---|---|---|---|---|",
         ]
         for environment in sorted({row.environment for row in rows}):
             lines += _list_trained([row for row in rows if row.environment == environment], budget)
@@ -193,7 +199,7 @@ def write_page(rows: list[Row]) -> None:
                 f"{name} {means[robot][BUDGETS.index(budget)]:,}" for name, means in PUBLISHED.items() if robot in means
             ]
             if known:
-                lines.append(f"| `{environment}` | *published* | 10 | {', '.join(known)} | | |")
+                lines.append(f"| `{environment}` | *published* | 10 | {', '.join(known)} | | | |")
     commands = dict.fromkeys(f"- {row.tool}: `{row.command}`" for row in rows)
     files.write_text(PAGE, "\n".join([*lines, "\n## The commands\n", *commands, ""]))
 
@@ -210,7 +216,10 @@ def _list_trained(rows: list[Row], budget: int) -> list[str]:
         middle = f"{Spread.of(scores.tolist()).iqm:,.0f} ({low:,.0f} to {high:,.0f})"
         each = ", ".join(f"{row.seed}: {row.score:,.0f}" for row in ends)
         minutes = float(np.median([row.minutes for row in ends]))
-        lines.append(f"| `{ends[0].environment}` | {tool} | {len(ends)} | {middle} | {each} | {minutes:.0f} |")
+        cores = ", ".join(sorted({str(row.cores) for row in ends}))
+        lines.append(
+            f"| `{ends[0].environment}` | {tool} | {len(ends)} | {middle} | {each} | {minutes:.0f} | {cores} |"
+        )
     return lines
 
 
@@ -257,11 +266,12 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="*", default=[0])
     parser.add_argument("--steps", type=int, default=BUDGETS[0], choices=BUDGETS)
     parser.add_argument("--add", type=Path, nargs="*", default=[], help="finished runs of rlctl")
+    parser.add_argument("--cores", type=int, default=available_cores(), help="that those runs had; default: all")
     options = parser.parse_args()
     if set(options.tools) & set(SBX) and PEERS["sbx"] not in os.environ:
         parser.error(f"set {PEERS['sbx']} to a Python with sbx and rlctl, or give --tools rlctl")
     for folder in options.add:
-        keep(read_run(folder))
+        keep(read_run(folder, options.cores))
     for environment, seed, tool in itertools.product(options.environments, options.seeds, options.tools):
         print(f"{environment} {tool} seed {seed}", file=sys.stderr, flush=True)
         keep(train(environment, tool, seed, options.steps))
