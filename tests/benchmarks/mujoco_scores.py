@@ -15,10 +15,12 @@ import csv
 import dataclasses
 import io
 import itertools
+import json
 import os
 import shlex
 import shutil
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ from rlctl.runs.compare.significance import interquartile_mean_interval
 from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
 from tests.benchmarks.compare import describe_command, describe_machine, follow, read_version
-from tests.benchmarks.shipped import read_csv
+from tests.benchmarks.shipped import read_csv, rlctl_command
 from tests.benchmarks.trainers import EPISODES, PEERS, read_evaluations, write_sbx
 
 ROWS, PAGE = Path("docs/mujoco-scores.csv"), Path("docs/mujoco-scores.md")
@@ -41,6 +43,7 @@ PICTURE = Path("docs/pictures/mujoco-scores.png")
 FOLDER = Path("build/mujoco-scores")
 BUDGETS = (200_000, 1_000_000)
 EVERY = 20_000  # steps between evaluations
+LAST_EPISODES = 100  # of the policy at the end
 _LEAST_FOR_INTERVAL = 5  # seeds
 
 PUBLISHED = {  # return on v4 after `BUDGETS`: means of ten seeds, from the curves that the authors publish
@@ -108,6 +111,7 @@ class Row:
     budget: int  # steps of the whole training: learning rates may depend on it
     steps: int
     score: float  # mean return of the evaluation
+    episodes: int
     minutes: float  # from the start of the training
     cores: int  # that the training had
     command: str
@@ -115,8 +119,8 @@ class Row:
     @classmethod
     def read(cls, row: dict[str, str]) -> Row:
         """Read a row of the file."""
-        numbers = {"seed": int, "budget": int, "steps": int, "score": float, "minutes": float, "cores": int}
-        return cls(**{name: numbers.get(name, str)(value) for name, value in row.items()})
+        kinds = {"int": int, "float": float, "str": str}
+        return cls(**{field.name: kinds[str(field.type)](row[field.name]) for field in dataclasses.fields(cls)})
 
     @property
     def training(self) -> tuple[str, str, int, int]:
@@ -136,13 +140,27 @@ def train(environment: str, tool: str, seed: int, budget: int) -> list[Row]:
         follow(command, list, folder / "log.txt", np.inf)
         return read_run(folder / "latest", available_cores())
     job = {"env": environment, "seed": seed, "steps": budget, "n_envs": 1, "every": EVERY, "folder": str(folder)}
-    command = write_sbx(job | {"episodes": EPISODES} | SBX[tool], folder)
+    command = write_sbx(job | {"episodes": EPISODES, "last_episodes": LAST_EPISODES} | SBX[tool], folder)
     evaluations = follow(command, lambda: read_evaluations(folder), folder / "log.txt", np.inf)
+    curve = [(EVERY * number, score, minutes) for number, (minutes, score) in enumerate(evaluations, start=1)]
     shared = environment, tool, read_version("sbx"), seed, budget
-    shown = describe_command(command, folder)
+    last = float((folder / "last.txt").read_text())
+    return _make_rows(shared, curve, last, available_cores(), describe_command(command, folder))
+
+
+def _make_rows(
+    training: tuple[str, str, str, int, int],
+    curve: list[tuple[int, float, float]],
+    last: float,
+    cores: int,
+    command: str,
+) -> list[Row]:
+    """Return a row for each evaluation: steps, score and minutes; `last` is the score of the policy at the end."""
+    *before, (steps, _, minutes) = curve
+    evaluations = [(*one, EPISODES) for one in before] + [(steps, last, minutes, LAST_EPISODES)]
     return [
-        Row(*shared, EVERY * number, round(score, 1), round(minutes, 2), available_cores(), shown)
-        for number, (minutes, score) in enumerate(evaluations, start=1)
+        Row(*training, steps, round(score, 1), episodes, round(minutes, 2), cores, command)
+        for steps, score, minutes, episodes in evaluations
     ]
 
 
@@ -152,16 +170,13 @@ def read_run(folder: Path, cores: int) -> list[Row]:
     status, recipe = run.status(), run.recipe()
     if status.get("status") != "finished":
         raise RuntimeError(f"{folder}: the training has not finished")
-    command = _describe_command(status, recipe)
-    tool, version = f"rlctl {recipe.algo}", read_version("rlctl")
-    shared = status["task"], tool, version, recipe.seed, recipe.total_timesteps
-    return [
-        Row(
-            *(*shared, int(row["steps"]), round(float(row["return"]), 1)),
-            *(round(float(row["seconds"]) / 60, 2), cores, command),
-        )
-        for row in read_csv(run.evals_file)
-    ]
+    shared = status["task"], f"rlctl {recipe.algo}", read_version("rlctl"), recipe.seed, recipe.total_timesteps
+    curve = [(int(row["steps"]), float(row["return"]), float(row["seconds"]) / 60) for row in read_csv(run.evals_file)]
+    with tempfile.NamedTemporaryFile(suffix=".json") as file:
+        options = ["--checkpoint", "last", "--episodes", str(LAST_EPISODES), "--json", file.name]
+        rlctl_command("eval", str(folder.resolve()), *options)
+        last = json.loads(Path(file.name).read_text())["return"]["mean"]
+    return _make_rows(shared, curve, last, cores, _describe_command(status, recipe))
 
 
 def _describe_command(status: dict[str, Any], recipe: Recipe) -> str:
@@ -181,9 +196,10 @@ def write_page(rows: list[Row]) -> None:
         "# Gymnasium's MuJoCo robots after 200,000 and 1,000,000 steps\n",
         f"Written by `python -m tests.benchmarks.mujoco_scores` on {describe_machine()}, from [every evaluation]"
         f"({ROWS.name}) of what was trained so far, of all seeds: interquartile mean of the seeds' mean",
-        f"returns of {EPISODES} episodes, its 95 % interval from {_LEAST_FOR_INTERVAL} seeds on, else their range.",
+        f"returns of {LAST_EPISODES} episodes of the policy at the end, its 95 % interval from {_LEAST_FOR_INTERVAL}",
+        f"seeds on, else their range; before the end, in the picture, {EPISODES} episodes.",
         "A training learns for as many steps as its budget. *Published* are means of ten seeds on v4, computed from",
-        "the curves of the authors, with networks many times as wide.\n",
+        "the curves of the authors, most with networks many times as wide.\n",
         f"![return over steps](pictures/{PICTURE.name})",
     ]
     for budget in BUDGETS:
@@ -213,7 +229,9 @@ def _list_trained(rows: list[Row], budget: int) -> list[str]:
         ends.sort(key=lambda row: row.seed)
         scores = np.array([row.score for row in ends])
         low, high = interquartile_mean_interval(scores) or (scores.min(), scores.max())
-        middle = f"{Spread.of(scores.tolist()).iqm:,.0f} ({low:,.0f} to {high:,.0f})"
+        middle = f"{Spread.of(scores.tolist()).iqm:,.0f}"
+        if len(scores) > 1:
+            middle += f" ({low:,.0f} to {high:,.0f})"
         each = ", ".join(f"{row.seed}: {row.score:,.0f}" for row in ends)
         minutes = float(np.median([row.minutes for row in ends]))
         cores = ", ".join(sorted({str(row.cores) for row in ends}))

@@ -83,6 +83,7 @@ _SBX = """
 import json, sys, gymnasium, sbx, rlctl.gym
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import SubprocVecEnv
 job = json.loads(sys.argv[1])
 if __name__ == "__main__":
@@ -93,6 +94,9 @@ if __name__ == "__main__":
     )
     model = getattr(sbx, job["algo"])(job.get("policy", "MlpPolicy"), env, seed=job["seed"], **job["settings"])
     model.learn(job["steps"], callback=callback)
+    if "last_episodes" in job:
+        score, _ = evaluate_policy(model, make_vec_env(job["env"]), job["last_episodes"])
+        open(job["folder"] + "/last.txt", "w").write(str(score))
 """
 _SBX_TQC = {**OFF_POLICY, "gradient_steps": 32, "policy_kwargs": {"net_arch": [256, 256]}}
 _SBX_PPO = {"learning_rate": 1.2e-3, "n_steps": 320, "batch_size": 640, "n_epochs": 5, "gamma": 0.93}
