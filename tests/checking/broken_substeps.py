@@ -30,11 +30,17 @@ class Airship(Robot):
         c, s = np.cos(angle), np.sin(angle)
         return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1], vector[2]])
 
+    def seen_goal(self):
+        return self.turn(self.goal - self.place, -self.yaw)
+
+    def seen_velocity(self):
+        return self.turn(self.velocity, -self.yaw)
+
     def observe(self):
         noise = self.np_random.normal
         parts = {
-            "goal": self.turn(self.goal - self.place, -self.yaw) + noise(0, 0.02, 3),
-            "velocity": self.turn(self.velocity, -self.yaw) + noise(0, 0.02, 3),
+            "goal": self.seen_goal() + noise(0, 0.02, 3),
+            "velocity": self.seen_velocity() + noise(0, 0.02, 3),
             "yaw_rate": np.array([self.yaw_rate + noise(0, 0.01)]),
             "heading": np.array([np.cos(self.yaw), np.sin(self.yaw)]),
             "time_left": np.array([max(0.0, 1.0 - self.ticks / self.limit)]),
