@@ -249,14 +249,25 @@ def find_declared_numbers(env: Any) -> dict[str, float]:
     return found | {name: float(one.numbers[0]) for name, one in own.items() if _is_number(one.value)}
 
 
+def find_weights(env: Any) -> set[float]:
+    """Return the numbers by which a term of the reward may be multiplied: those declared, and those in the source."""
+    return _find_literals(env) | {abs(value) for value in find_declared_numbers(env).values()}
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_)
 
 
 def _find_literals(env: Any) -> set[float]:
-    """Return the numbers that the source of its classes' modules has."""
+    """Return the numbers that the source of its classes' modules has, without frequencies: the 240 of `1 / 240`."""
     found: set[float] = set()
     for tree in parse_sources(env).values():
-        values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+        nodes = list(ast.walk(tree))
+        frequencies = {id(node.right) for node in nodes if isinstance(node, ast.BinOp) and _is_time(node)}
+        values = [node.value for node in nodes if isinstance(node, ast.Constant) and id(node) not in frequencies]
         found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found
+
+
+def _is_time(node: ast.BinOp) -> bool:
+    return isinstance(node.op, ast.Div) and isinstance(node.left, ast.Constant)
