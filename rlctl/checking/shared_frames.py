@@ -6,13 +6,20 @@ lengths of a place tell how a velocity has to be turned to belong to it.
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.body_frames import turn_plane
-from rlctl.checking.worlds import Array
+from rlctl.checking import attitudes
+from rlctl.checking.body_frames import list_turns_of, turn_plane
+from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.worlds import ObservedWorld
+from rlctl.checking.records import Built
+from rlctl.checking.step_times import find_rates
+from rlctl.checking.transitions import find_float_leaves
+from rlctl.checking.values import is_task
+from rlctl.checking.worlds import ORIENTATION, Array
 
 MOST_ELEMENTS, MOST_TURNS = 40, 12
 MOST_LOOKS, LONGEST = 1_000, 150  # that are compared, and of an episode
@@ -27,6 +34,8 @@ FITS, MISFITS, CLEARLY = 0.05, 0.01, 8.0
 """Part of what the lengths change that is left where velocities fit at most, and where they do not at least; how many
 times more that is."""
 LEAST_WAY = 1e-3  # root mean square of what the lengths change in a window
+SAME_VELOCITY = 0.95  # correlation of what is observed with a velocity in the world, with noise
+EQUAL = 1e-3  # elements of rotations that are one
 LEAST_TURN = 0.15  # root mean square of a rotation minus its inverse: smaller ones have no wrong way
 
 
@@ -48,7 +57,7 @@ class Turn:
         changes = np.diff(self.matrices, axis=0)[episodes[1:] == episodes[:-1]]
         return bool(np.sqrt(np.mean(np.square(changes))) < MOST_CHANGE)
 
-    def select(self, looks: NDArray[np.bool_]) -> "Turn":
+    def select(self, looks: NDArray[np.bool_] | NDArray[np.intp]) -> "Turn":
         """Return it in some of the looks."""
         return Turn(self.name, self.matrices[looks], self.columns)
 
@@ -77,7 +86,8 @@ class Misfit(NamedTuple):
     place is not; twice, in either direction, where one of them was turned the wrong way."""
 
 
-RIGHT, WRONG = (0, 1), (-1, 2, -2)
+IN_WORLD = -1
+RIGHT, WRONG = (0, 1), (IN_WORLD, 2, -2)
 """Powers: of a velocity in the frame of the place, or in that of the body while the place is in the world; and of what
 is in no frame that belongs to it."""
 
@@ -219,3 +229,57 @@ def _measure(
         rests = np.where(np.abs(np.abs(factors) / seconds - 1) < SAME_TIME, rests, 1.0)
     is_moving = np.sqrt(size / kept.sum(axis=0)) > LEAST_WAY
     return np.where(is_moving, np.minimum(rests, 1.0), 1.0)
+
+
+def list_world_turns(one: ObservedWorld) -> list[Turn]:
+    """Return how the bodies and links of a world are turned, each orientation once."""
+    world, turns = one.logs[0].world, list[Turn]()
+    for link in one.logs[0].poses[0]:
+        if not all(link in poses for log in one.logs for poses in log.poses):
+            continue
+        quaternions = np.array([poses[link][ORIENTATION] for log in one.logs for poses in log.poses])
+        turn = Turn(f"the orientation of {world.link_name(link)}", attitudes.compute_matrices(quaternions))
+        if turn.is_turned and all(np.abs(turn.matrices - other.matrices).max() > EQUAL for other in turns):
+            turns.append(turn)
+    return turns
+
+
+def list_attribute_turns(log: AttributeLog) -> list[Turn]:
+    """Return every orientation that attributes may be."""
+    return [Turn(name, matrices) for name, matrices in list_turns_of(log.names, log.values)]
+
+
+def is_world_velocity(log: AttributeLog, vectors: Array) -> bool:
+    """Say whether what is observed is that by which attributes change. Shape (looks, 2 or 3)."""
+    rates = {rate for _, rate, _ in find_rates(log, log.values)}
+    columns = [log.values[:, rate] for rate in sorted(rates)]
+    level = vectors.T[:2]  # which a heading turns
+    return all(any(_correlate(vector, column) > SAME_VELOCITY for column in columns) for vector in level)
+
+
+def _correlate(one: Array, two: Array) -> float:
+    return float(np.corrcoef(one, two)[0, 1]) if one.std() > 0 and two.std() > 0 else 0.0
+
+
+def name_elements(built: Built) -> tuple[list[str], list[int]]:
+    """Return the names of the elements that rules read, and the array that each belongs to."""
+    leaves = find_float_leaves(built.leaves)
+    places = [(leaf, i) for leaf in leaves for i in range(int(np.prod(built.leaves[leaf].shape)))]
+    return [built.element(leaf, i) for leaf, i in places], [leaf for leaf, _ in places]
+
+
+def name_observed(env: Any, one: ObservedWorld) -> tuple[list[str], list[str]]:
+    """Return the names of the elements of an observation, and the part that each belongs to: an array of it, or what a
+    task observes by a name."""
+    if is_task(env):
+        sizes = dict(env.unwrapped.observation_sizes)
+        parts = [name for name, size in sizes.items() for _ in range(size)]
+        if len(parts) == one.logs[0].observed[0].size:
+            return [f"{name}[{i}]" for name, size in sizes.items() for i in range(size)], parts
+    parts = [name for name, size in one.logs[0].parts for _ in range(size)]
+    return [one.name_element(i) for i in range(len(parts))], parts
+
+
+def name_part(names: Sequence[str]) -> str:
+    """Name some elements that follow each other."""
+    return f"({names[0]} to {names[-1]})"
