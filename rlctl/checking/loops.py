@@ -1,23 +1,29 @@
 """How often the loops of a step repeat their bodies, by the source: so many substeps a step may have."""
 
 import ast
-import contextlib
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Mapping
+import math
+import operator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from rlctl.checking.values import find_author, list_own_classes, parse_sources
 
 FIRST_CALLED = ("step", "act", "simulate", "do_simulation")
 """What begins a step of an environment, or of a task of rlctl."""
-BINARY = {
-    ast.Add: lambda a, b: a + b,
-    ast.Sub: lambda a, b: a - b,
-    ast.Mult: lambda a, b: a * b,
-    ast.Div: lambda a, b: a / b,
-    ast.FloorDiv: lambda a, b: a // b,
+BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
 }
-ROUNDING = {"int": int, "round": round, "max": max, "min": min}
+ROUNDING: Mapping[str, Callable[[list[float]], float]] = {
+    "int": lambda values: int(values[0]),
+    "round": lambda values: round(values[0]),
+    "max": max,
+    "min": min,
+}
 
 
 def find_repeats(env: Any, declared: Mapping[str, float]) -> dict[str, int]:
@@ -32,7 +38,7 @@ def find_repeats(env: Any, declared: Mapping[str, float]) -> dict[str, int]:
         local = numbers | _read_local(function, numbers)
         for repeats in _find_loops(function):
             value = _evaluate(repeats, local)
-            if value is not None and value == int(value) > 1:
+            if value is not None and math.isfinite(value) and value == int(value) > 1:
                 found[ast.unparse(repeats)] = int(value)
     return found
 
@@ -92,11 +98,12 @@ def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float | None:
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, int | float) else None
     if isinstance(node, ast.BinOp) and type(node.op) in BINARY:
-        values = [_evaluate(part, numbers) for part in (node.left, node.right)]
-        with contextlib.suppress(ZeroDivisionError):
-            return None if None in values else BINARY[type(node.op)](*values)
-        return None
+        left, right = _evaluate(node.left, numbers), _evaluate(node.right, numbers)
+        if left is None or right is None or (right == 0 and isinstance(node.op, ast.Div | ast.FloorDiv)):
+            return None
+        return BINARY[type(node.op)](left, right)
     if isinstance(node, ast.Call) and _name(node.func) in ROUNDING and node.args:
         values = [_evaluate(part, numbers) for part in node.args]
-        return None if None in values else ROUNDING[_name(node.func)](*values)
+        known = [value for value in values if value is not None and math.isfinite(value)]
+        return ROUNDING[_name(node.func)](known) if len(known) == len(values) else None
     return numbers.get(_name(node))
