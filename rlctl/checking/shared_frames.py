@@ -52,7 +52,7 @@ class Turn:
         """Whether the wrong way can be told from the right one."""
         return float(np.sqrt(np.mean(np.square(self.matrices - self.matrices.transpose(0, 2, 1))))) >= LEAST_TURN
 
-    def is_slow(self, episodes: Array) -> bool:
+    def is_slow(self, episodes: NDArray[np.int_]) -> bool:
         """Say whether it changes little from look to look, as a heading does."""
         changes = np.diff(self.matrices, axis=0)[episodes[1:] == episodes[:-1]]
         return bool(np.sqrt(np.mean(np.square(changes))) < MOST_CHANGE)
@@ -95,7 +95,7 @@ is in no frame that belongs to it."""
 def find_misfits(
     observed: Array,
     parts: Sequence[object],
-    episodes: Array,
+    episodes: NDArray[np.int_],
     turns: Sequence[Turn],
     seconds: float,
     powers: Sequence[int] = WRONG,
@@ -119,7 +119,7 @@ def find_misfits(
             return
 
 
-def fits(observed: Array, episodes: Array, place: slice, velocity: slice) -> bool:
+def fits(observed: Array, episodes: NDArray[np.int_], place: slice, velocity: slice) -> bool:
     """Say whether a place and a velocity are in the same frame."""
     few = _choose_looks(episodes)
     starts, size = _list_starts(episodes[few]), place.stop - place.start
@@ -128,7 +128,7 @@ def fits(observed: Array, episodes: Array, place: slice, velocity: slice) -> boo
     return bool(rest[0, 0] < FITS)
 
 
-def _choose_looks(episodes: Array) -> NDArray[np.bool_]:
+def _choose_looks(episodes: NDArray[np.int_]) -> NDArray[np.bool_]:
     """Return which looks are compared: of all episodes some, whole."""
     names, counts = np.unique(episodes, return_counts=True)
     ends = np.cumsum(np.minimum(counts, LONGEST))
@@ -137,7 +137,7 @@ def _choose_looks(episodes: Array) -> NDArray[np.bool_]:
     return np.asarray(np.isin(episodes, names[::stride]) & (place < LONGEST))
 
 
-def _list_starts(episodes: Array) -> NDArray[np.intp]:
+def _list_starts(episodes: NDArray[np.int_]) -> NDArray[np.intp]:
     """Return the looks at which windows begin."""
     last = max(0, len(episodes) - WINDOW)
     starts = np.flatnonzero(episodes[:last] == episodes[WINDOW:][:last])
@@ -173,7 +173,7 @@ def _find_of_size(
     is_found = (left < FITS) & (right.min(axis=(0, 1)) > np.maximum(MISFITS, CLEARLY * left))
     for one, two in np.argwhere(is_found).tolist():
         place, velocity = firsts[one], firsts[two]
-        number, power = np.unravel_index(int(wrong[:, :, one, two].argmin()), wrong.shape[:2])
+        number, power = divmod(int(wrong[:, :, one, two].argmin()), wrong.shape[1])
         matrices = np.linalg.matrix_power(turns[number].reduce(size), powers[power])
         vectors = blocks[:, two]
         if abs(place - velocity) >= size and _varies(vectors) and _varies(np.einsum("nij,nj->ni", matrices, vectors)):

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
@@ -143,7 +144,7 @@ def _moves(steps: _Steps, first: int) -> bool:
 
 
 def _list_differences(
-    steps: _Steps, turns: Sequence[Turn], kept: Array, wanted: Array, velocities: Sequence[int]
+    steps: _Steps, turns: Sequence[Turn], kept: NDArray[np.bool_], wanted: Array, velocities: Sequence[int]
 ) -> tuple[Array, list[tuple[int, int, int]]]:
     """Return how far velocities are from a command, shape (steps, ways), and of each which velocity, turn and power it
     is."""

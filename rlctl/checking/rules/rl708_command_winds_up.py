@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, action_at
 from rlctl.checking.experiment import PROBE, experiment
@@ -196,24 +197,23 @@ def _measure(
         turned = trials.play(seed, [held_action] * turn + [turned_action] * (steps - turn))
         others = turned.commands if trials.has_engine else np.delete(turned.values, sorted(copies), axis=1)
         stuck.append(_count_stuck(rows, others, followers, turn))
+    # What nothing answers to the end of the episode counts as answered there.
     if stuck[1] < FEWEST_STUCK or stuck[1] - stuck[0] < max(2, GROWTH * (second - first)):
         return None
     return first, stuck[0], second, stuck[1], float(held.values[second, one.column])
 
 
-def _find_followers(rows: Array, first: int, second: int, *, exact: bool) -> Array:
+def _find_followers(rows: Array, first: int, second: int, *, exact: bool) -> NDArray[np.intp]:
     """Return the columns that moved at first, and then rest while the action is still held."""
-    if rows.shape[1] == 0 or not np.isfinite(rows[1:]).all():
-        rows = np.nan_to_num(rows)
-    changes = np.abs(np.diff(rows[1:], axis=0))
+    changes = np.abs(np.diff(np.nan_to_num(rows[1:]), axis=0))
     early, late = changes[: first - 1], changes[first - 1 : second - 1]
     if not len(early) or not len(late):
-        return np.zeros(0, int)
+        return np.zeros(0, np.intp)
     most = 0.0 if exact else RESTING
     return np.flatnonzero((early.max(axis=0) > 0) & (late.max(axis=0) <= most * early.max(axis=0)))
 
 
-def _count_stuck(held: Array, turned: Array, followers: Array, turn: int) -> int:
+def _count_stuck(held: Array, turned: Array, followers: NDArray[np.intp], turn: int) -> int:
     """Return after how many steps with the opposite action something differs from holding it on."""
     length = min(len(held), len(turned))
     differs = (held[turn + 1 : length, followers] != turned[turn + 1 : length, followers]).any(axis=1)
