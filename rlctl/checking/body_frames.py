@@ -78,21 +78,31 @@ def _owner(name: str) -> str:
 
 def _list_turns(log: AttributeLog, size: int) -> Iterator[tuple[str, Numbers]]:
     """Yield every orientation that attributes may be, and its inverse, as matrices. Shape (looks, size, size)."""
-    for name, matrices in _list_matrices(log, size):
+    for name, matrices in _list_matrices(log.names, log.values, size):
         yield name, matrices
         yield name, matrices.transpose(0, 2, 1)
 
 
-def _list_matrices(log: AttributeLog, size: int) -> Iterator[tuple[str, Numbers]]:
+def list_turns_of(names: Sequence[str], values: Numbers) -> Iterator[tuple[str, Numbers]]:
+    """Yield every orientation that numbers may be, as matrices: angles about the vertical, quaternions, matrices, and
+    three angles. Shape of values: (looks, names), of matrices: (looks, 3, 3)."""
+    for name, level in _list_matrices(names, values, 2):
+        matrices = np.tile(np.eye(3), (len(level), 1, 1))
+        matrices[:, :2, :2] = level
+        yield name, matrices
+    yield from _list_matrices(names, values, 3)
+
+
+def _list_matrices(names: Sequence[str], values: Numbers, size: int) -> Iterator[tuple[str, Numbers]]:
     owners: dict[str, list[int]] = {}
-    for column, name in enumerate(log.names):
+    for column, name in enumerate(names):
         owners.setdefault(_owner(name) or name, []).append(column)
     for name, columns in owners.items():
-        rows = log.values[:, columns]
+        rows = values[:, columns]
         if size == 2:
             for place, column in enumerate(columns):
-                if log.values[:, column].std() > LEAST_TURN / 2:
-                    yield log.names[column], turn_plane(rows[:, place])
+                if values[:, column].std() > LEAST_TURN / 2:
+                    yield names[column], turn_plane(rows[:, place])
         for first in range(len(columns) - 3):
             quaternion = rows[:, first : first + 4]
             if np.abs(np.linalg.norm(quaternion, axis=1) - 1).max() < UNIT:

@@ -13,6 +13,7 @@ from rlctl.checking.term_names import split_name
 SUBSTEP_WORDS = {"substeps", "substep", "decimation", "skip", "frameskip", "repeat", "inner"}
 """Of names that say how many steps of the physics a step has."""
 TIME_WORDS = {"dt", "timestep", "step"}
+SHORT_TIME_WORDS = {"h", "ts"}  # of times, where nothing is called by the others
 MOST_SUBSTEPS = 200
 LEAST_MOTION = 1e-6
 SAME = 0.99  # correlation of a change and of what changes by it
@@ -89,12 +90,17 @@ def find_declared(log: AttributeLog) -> DeclaredTimes | None:
     }
     # A module may have constants of another robot.
     counts = {name: count for name, count in named.items() if name.startswith("self.")} or named
-    times = {name: value for name, value in log.declared.items() if set(words_of(name)) & TIME_WORDS and 0 < value < 1}
+    counts = counts or {name: count for name, count in log.repeats.items() if count <= MOST_SUBSTEPS}
+    times = _list_times(log, TIME_WORDS) or _list_times(log, SHORT_TIME_WORDS)
     times |= {name: 1 / log.declared[name] for name in RATES if log.declared.get(name, 0) > 1}
     if len(set(counts.values())) != 1 or not times:
         return None
     count, substeps = next(iter(counts.items()))
     return DeclaredTimes(count, substeps, times)
+
+
+def _list_times(log: AttributeLog, words: set[str]) -> dict[str, float]:
+    return {name: value for name, value in log.declared.items() if set(words_of(name)) & words and 0 < value < 1}
 
 
 def words_of(name: str) -> list[str]:

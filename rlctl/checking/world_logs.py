@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import math
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rlctl.checking.bullet_worlds import BulletStateReader, read_world
-from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED
-from rlctl.checking.values import flatten, flatten_action, list_parts
+from rlctl.checking.values import find_numbers, flatten, flatten_action, list_parts
 from rlctl.checking.worlds import (
     ANGULAR,
     JOINTS,
@@ -65,6 +66,8 @@ class WorldLog:
     observed: list[Array] = dataclasses.field(default_factory=list)  # flat observations
     parts: list[tuple[str, int]] = dataclasses.field(default_factory=list)  # name and size of each of their arrays
     given: list[Array] = dataclasses.field(default_factory=list)  # flat actions; of reset empty
+    told: list[dict[str, float]] = dataclasses.field(default_factory=list)  # numbers of info by name; of reset empty
+    rewards: list[float] = dataclasses.field(default_factory=list)  # NaN at a reset, and where it is no number
     before: list[tuple[list[Array], Poses] | None] = dataclasses.field(default_factory=list)
     """What the reader has of the moment before the last call that advanced the physics."""
     targets: list[dict[JointKey, MotorTarget]] = dataclasses.field(default_factory=list)
@@ -72,7 +75,7 @@ class WorldLog:
     weights: dict[JointKey, float] = dataclasses.field(default_factory=dict)  # at reset
     failure: str = ""  # What the engine itself reported
 
-    def look(self, place: Place, observation: Any, action: Array) -> bool:
+    def look(self, place: Place, moment: Moment, action: Array) -> bool:
         """Add the present state; return False if the world is gone or has other bodies."""
         reader = self.reader
         try:
@@ -83,7 +86,7 @@ class WorldLog:
             deep = self._find_deep(contacts)
             if not self.places:
                 self.weights = reader.read_weights()
-                self.parts = list(list_parts(observation))
+                self.parts = list(list_parts(moment.observation))
                 self.overlaps = self._find_deep(reader.read_overlaps())
         except reader.errors:
             return False
@@ -93,8 +96,11 @@ class WorldLog:
         self.touching.append(set(contacts))
         self.poses.append(poses)
         self.points.append(points)
-        self.observed.append(flatten(observation))
+        self.observed.append(flatten(moment.observation))
         self.given.append(action)
+        has_told = moment.step and isinstance(moment.info, dict)
+        self.told.append(dict(find_numbers(moment.info)) if has_told else {})
+        self.rewards.append(moment.reward_number if moment.step else math.nan)
         self.before.append(reader.read_before())
         self.targets.append(targets)
         self.commands.append(reader.read_command())
@@ -177,7 +183,7 @@ class WorldLogger:
             logs = logs if moment.step else self._begin(kind)
             leaves = self.instance.action_leaves if moment.step else []
             action = flatten_action(leaves, moment.action)
-            logs = [log for log in logs if log.look(place, moment.observation, action)]
+            logs = [log for log in logs if log.look(place, moment, action)]
             if moment.step == 0:
                 self.calls.targets.clear()
             self._watch(logs)

@@ -17,6 +17,7 @@ from rlctl.checking.bullet_worlds import read_states, read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
+from rlctl.checking.loops import find_repeats
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.term_names import is_about_steps, is_paid
@@ -67,6 +68,7 @@ class AttributeLog:
     episodes: NDArray[np.int64]  # Shape (looks,)
     declared: Mapping[str, float]  # numbers of the object, its class and its module that do not change, by name
     literals: tuple[float, ...]  # numbers in the source of its classes
+    repeats: Mapping[str, int]  # how often loops of a step repeat, by what their `range` has
 
     @property
     def is_step(self) -> NDArray[np.bool_]:
@@ -210,6 +212,7 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) 
         for i in range(part.shape[1])
     ]
     width = max(look.action.size for look in looks)
+    declared = find_declared_numbers(instance.env)
     info_names = {name: None for look in looks for name in look.infos}
     return AttributeLog(
         names=names[:MOST_NUMBERS],
@@ -222,8 +225,9 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) 
         seconds=np.array([look.seconds for look in looks]),
         physics_s=_Engine.find(instance, clients).physics_s,
         episodes=np.array([look.episode for look in looks]),
-        declared={name: value for name, value in find_declared_numbers(instance.env).items() if name not in names},
+        declared={name: value for name, value in declared.items() if name not in names},
         literals=tuple(sorted(_find_literals(instance.env))),
+        repeats=find_repeats(instance.env, declared),
     )
 
 
@@ -245,14 +249,25 @@ def find_declared_numbers(env: Any) -> dict[str, float]:
     return found | {name: float(one.numbers[0]) for name, one in own.items() if _is_number(one.value)}
 
 
+def find_weights(env: Any) -> set[float]:
+    """Return the numbers by which a term of the reward may be multiplied: those declared, and those in the source."""
+    return _find_literals(env) | {abs(value) for value in find_declared_numbers(env).values()}
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_)
 
 
 def _find_literals(env: Any) -> set[float]:
-    """Return the numbers that the source of its classes' modules has."""
+    """Return the numbers that the source of its classes' modules has, without frequencies: the 240 of `1 / 240`."""
     found: set[float] = set()
     for tree in parse_sources(env).values():
-        values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+        nodes = list(ast.walk(tree))
+        frequencies = {id(node.right) for node in nodes if isinstance(node, ast.BinOp) and _is_time(node)}
+        values = [node.value for node in nodes if isinstance(node, ast.Constant) and id(node) not in frequencies]
         found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found
+
+
+def _is_time(node: ast.BinOp) -> bool:
+    return isinstance(node.op, ast.Div) and isinstance(node.left, ast.Constant)

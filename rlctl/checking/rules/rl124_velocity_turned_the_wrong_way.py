@@ -62,6 +62,11 @@ def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog | None = records.facts.get("attributes")
     if log is None or np.isfinite(log.physics_s):
         return  # the engine tells more
+    yield from find_wrong_turns(log)
+
+
+def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:
+    """Yield the first velocity, or gravity, that a robot without an engine observes turned the wrong way."""
     for frame in find_body_frames(log):
         for vectors in _list_vectors(frame):
             for finding in _find_in_observation(log.observed, vectors):

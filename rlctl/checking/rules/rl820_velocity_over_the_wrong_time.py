@@ -9,11 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.engine_values import NOISY, NOISY_FACTOR, EngineValues, explain, is_white
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import AttributeLog, find_weights
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.joint_copies import LEAST_MOTION
 from rlctl.checking.readings import MOST_ELEMENTS, name_features, read_features
-from rlctl.checking.rule import Rule, RuleFinding, Severity, list_others
+from rlctl.checking.records import Records
+from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity, list_others
+from rlctl.checking.step_times import StepTimes, require_step_times
 from rlctl.checking.term_names import split_name
+from rlctl.checking.told_speeds import (
+    ToldSpeed,
+    find_told_speeds,
+    read_attribute_ways,
+    read_engine_ways,
+    read_told,
+)
+from rlctl.checking.transitions import name_floats
 from rlctl.checking.worlds import Array
 
 RULE = Rule(
@@ -22,7 +34,8 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         An element of the observation is how far something moved in a whole step of the environment, divided by
-        the time of one step of the physics; or several are, turned into some frame. The velocity is too large by
+        the time of one step of the physics; or several are, turned into some frame; or a number of info is, such as the
+        speed that is paid, or a term of the reward. The velocity is too large by
         the number of physics steps, and a controller of the real robot that measures it right gives the policy
         something else. So it is where the change is not divided by any time, and a name or other elements say that
         velocities are meant; otherwise that is an info. Objects that nobody moved are thrown to see it.
@@ -49,9 +62,56 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for number, one in enumerate([*watched.observed, *watched.thrown]):
         changes = _read_changes(one)
         found = list(_find_wrong_times(one, changes)) if changes is not None else []
+        if not found and number < len(watched.observed):
+            found = list(_find_told(one, changes, watched)) if changes is not None else []
         yield from found
         if found and number >= len(watched.observed) - 1:
             return  # what was thrown would show the same
+
+
+def _find_told(one: ObservedWorld, changes: "_Changes", watched: WatchedWorlds) -> Iterator[RuleFinding]:
+    """Yield a number of info, or the reward, that is a way in a step over the time of a step of the physics."""
+    ways = read_engine_ways(one.logs)
+    if changes.substeps <= 1 or ways is None:
+        return
+    names = {name for log in one.logs for told in log.told for name in told}
+    rows = [pair for log in one.logs for pair in zip(log.told[1:], log.rewards[1:], strict=True)]
+    infos = {name: np.array([told.get(name, np.nan) for told, _ in rows]) for name in names}
+    told = read_told(infos, np.array([reward for _, reward in rows]))
+    times = StepTimes(changes.seconds, changes.time_step, "the engine")
+    actions = np.concatenate([np.stack(log.given[1:]) for log in one.logs if len(log.given) > 1])
+    for speed in find_told_speeds(told, ways, times, find_weights(watched.instance.env), actions):
+        yield _describe_told(speed, times)
+        return
+
+
+@judges_records(RULE, "worlds", "attributes")
+def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
+    """Yield what a robot without an engine tells."""
+    log: AttributeLog | None = records.facts.get("attributes")
+    if log is None or np.isfinite(log.physics_s):
+        return  # the engine tells more
+    try:
+        times = require_step_times(log)
+    except NotApplicable:
+        return
+    told = {name: values[log.is_step] for name, values in read_told(log.infos, log.rewards).items()}
+    told |= {
+        name: log.observed[log.is_step, column]
+        for column, name in enumerate(name_floats(records.require_built().leaves))
+    }
+    weights = [*log.literals, *map(abs, log.declared.values())]
+    for speed in find_told_speeds(told, read_attribute_ways(log), times, weights, log.actions[log.is_step]):
+        yield _describe_told(speed, times)
+        return
+
+
+def _describe_told(speed: ToldSpeed, times: StepTimes) -> RuleFinding:
+    weight = "" if math.isclose(speed.weight, 1.0, rel_tol=CLOSE) else f"{speed.weight:.4g} times "
+    what = f"{speed.name} is {weight}the change of {speed.way} in a step, divided by {times.physics_s:.4g} s"
+    taken = f"the step takes {times.control_s:.4g} s, {times.substeps} steps of the physics"
+    message = f"{what}; {taken}: it is {times.substeps} times too large"
+    return RuleFinding(RULE, message, {"element": speed.name, "value": times.physics_s, "expected": times.control_s})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,10 +20,10 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A clock that each step advances runs with the time of one step of the physics, or counts the steps of the
-        physics as if each was a whole step: the phase of a gait whose period is declared, a time in seconds, a time
-        feature of the observation, or the time limit. All of them are then wrong by the number of physics steps in a
-        step. Times are those of the engine; in a robot without an engine they are what it declares, as `dt` and
-        `substeps`, and what its positions and velocities confirm.
+        physics as if each was a whole step: the phase of a gait whose period is declared, a time in seconds, passed or
+        left, a time feature of the observation, or the time limit. All of them are then wrong by the number of physics
+        steps in a step. Times are those of the engine; in a robot without an engine they are what it declares, as `dt`
+        and `substeps` or by a loop of its step, and what its positions and velocities confirm.
     """,
     fix="""
         Advance the clock once in each step, by the time between two actions: the physics step times frame_skip, which
@@ -38,9 +38,10 @@ LEAST_STEPS = 20
 LEAST_SWING, SINE_ERROR = 0.05, 2e-6
 SLOWEST = math.cos(0.01)  # what turns less in a step [rad] cannot be told from a line
 WRAPS = 0.3  # part of the steps in which a phase may begin again
+STOPS = 0.4  # part of the steps in which a clock may stand at its end
 PERIOD_WORDS = {"period", "cycle", "gait"}
 FREQUENCY_WORDS = {"freq", "frequency", "hz", "cadence"}
-TIME_WORDS = {"t", "time", "clock", "seconds", "elapsed"}
+TIME_WORDS = {"t", "time", "clock", "seconds", "elapsed", "remaining", "timer"}
 LIMIT_WORDS = {"max", "limit", "episode", "horizon", "length", "duration"}
 SECOND_WORDS = {"s", "sec", "secs", "seconds", "time", "duration"}
 STEP_WORDS = {"steps"}
@@ -53,9 +54,14 @@ class _Clock:
     """What advances by the same in each step."""
 
     name: str
-    advance: float  # in a step
+    advance: float  # in a step; below 0 where it shows what is left
     is_angle: bool  # of a cosine and a sine
     is_observed: bool
+
+    @property
+    def verb(self) -> str:
+        """What it does in each step."""
+        return "advances" if self.advance > 0 else "falls"
 
 
 @judges_records(RULE, *RECORDING, "attributes")
@@ -63,8 +69,11 @@ def _find_wrong_clocks(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
     times = require_step_times(log)
     limit = _find_limit(records)
+    most_steps = limit or _find_declared_limit(records, log)
     found = [
-        finding for clock in _find_clocks(records, log) for finding in _judge_clock(clock, log.declared, times, limit)
+        finding
+        for clock in _find_clocks(records, log)
+        for finding in _judge_clock(clock, log.declared, times, most_steps)
     ]
     if limit is not None and records.require_built().max_steps != limit:
         found += _judge_limit(limit, log.declared, times)
@@ -75,6 +84,19 @@ def _find_limit(records: Records) -> int | None:
     """Return after how many steps episodes are cut off; None where that is not always the same."""
     lengths = {episode.steps for episode in records.alone if episode.ended == "truncated"}
     return lengths.pop() if len(lengths) == 1 else None
+
+
+def _find_declared_limit(records: Records, log: AttributeLog) -> int | None:
+    """Return the time limit that an environment declares, where no episode has come to it."""
+    if limit := records.require_built().max_steps:
+        return limit
+    limits = {value for name, value in log.declared.items() if {*words_of(name)} & LIMIT_WORDS and _is_in_steps(name)}
+    return int(limits.pop()) if len(limits) == 1 else None
+
+
+def _is_in_steps(name: str) -> bool:
+    words = set(words_of(name))
+    return bool(words & STEP_WORDS and not words & PHYSICS_WORDS)
 
 
 def _find_clocks(records: Records, log: AttributeLog) -> Iterator[_Clock]:
@@ -101,10 +123,12 @@ def _find_clocks(records: Records, log: AttributeLog) -> Iterator[_Clock]:
 
 def _find_advance(changes: Array) -> float | None:
     advance = float(np.median(changes))
+    forwards = changes * np.sign(advance)
     is_usual = np.abs(changes - advance) <= EXACT * abs(advance)
-    is_wrap = changes < 0
-    is_clock = advance > 0 and bool((is_usual | is_wrap).all()) and is_wrap.mean() < WRAPS
-    return advance if is_clock else None
+    is_wrap = forwards < 0
+    is_stop = (forwards >= 0) & (forwards < abs(advance))  # at its end, which it may reach within a step
+    is_clock = advance != 0 and bool((is_usual | is_wrap | is_stop).all())
+    return advance if is_clock and is_wrap.mean() < WRAPS and (~is_usual & is_stop).mean() < STOPS else None
 
 
 def _find_sine(log: AttributeLog, values: Array) -> float | None:
@@ -132,20 +156,21 @@ def _judge_clock(
                     message = f"{clock.name} takes {shown_s:.4g} s for a whole turn, and {name} says {period:.4g} s"
                     yield _finding(clock.name, f"{message}: {_name_wrong(seconds, times)}", shown_s, period)
                     return
-    is_part = limit is not None and math.isclose(clock.advance * limit, 1.0, rel_tol=2 / limit)
+    advance = abs(clock.advance)
+    is_part = limit is not None and math.isclose(advance * limit, 1.0, rel_tol=2 / limit)
     if clock.is_angle or is_part:
         return
     is_time = set(words_of(clock.name)) & TIME_WORDS or clock.is_observed
-    if is_time and clock.advance != round(clock.advance) and (wrong := _name_wrong(clock.advance, times)):
-        message = f"{clock.name} advances by {clock.advance:.4g} in a step that takes {times.control_s:.4g} s"
-        yield _finding(clock.name, f"{message}: {wrong}", clock.advance, times.control_s)
+    if is_time and advance != round(advance) and (wrong := _name_wrong(advance, times)):
+        message = f"{clock.name} {clock.verb} by {advance:.4g} in a step that takes {times.control_s:.4g} s"
+        yield _finding(clock.name, f"{message}: {wrong}", advance, times.control_s)
         return
-    if limit is None or not clock.is_observed or clock.advance == round(clock.advance):
+    if limit is None or not clock.is_observed or advance == round(advance):
         return
-    end = clock.advance * limit
+    end = advance * limit
     for factor in (times.substeps, 1 / times.substeps):
         if math.isclose(end, factor, rel_tol=2 / limit):
-            message = f"{clock.name} is {end:.3g} at the end of an episode of {limit} steps"
+            message = f"{clock.name} {clock.verb} by {end:.3g} of 1 in an episode of {limit} steps"
             yield _finding(clock.name, f"{message}, and each has {times.substeps} steps of the physics", end, 1.0)
             return
 
@@ -178,7 +203,7 @@ def _name_wrong(seconds: float, times: StepTimes) -> str:
 def _judge_limit(limit: int, declared: Mapping[str, float], times: StepTimes) -> Iterator[RuleFinding]:
     limits = {name: value for name, value in declared.items() if set(words_of(name)) & LIMIT_WORDS and value > 0}
     seconds = {n: v for n, v in limits.items() if set(words_of(n)) & SECOND_WORDS}
-    steps = {n: v for n, v in limits.items() if set(words_of(n)) & STEP_WORDS and not set(words_of(n)) & PHYSICS_WORDS}
+    steps = {name: value for name, value in limits.items() if _is_in_steps(name)}
     if limit in limits.values() or any(_ends_at(limit * times.control_s, v, times.control_s) for v in seconds.values()):
         return
     for name, value in seconds.items():

@@ -19,7 +19,7 @@ RULE = Rule(
         In a robot without an engine a position or an angle changes by its velocity times another time than all others
         do: by the time of a whole step in each of its substeps, or by that of one substep in a whole step. It moves
         so many times faster or slower than its velocity says. How long a step takes is what the robot declares, as
-        `dt` and `substeps`, and what its other positions and velocities confirm.
+        `dt` and `substeps` or by a loop of its step, and what its other positions and velocities confirm.
     """,
     fix="Integrate everything with the time of the loop that it is in: the substep's time inside the loop of substeps.",
 )
