@@ -221,6 +221,7 @@ class Records:
     finished: dict[str, Finished] = dataclasses.field(default_factory=dict)  # by experiment
     shortened: dict[str, str] = dataclasses.field(default_factory=dict)  # experiment -> `12 of 16 episodes`
     normalizes: Callable[[str], bool] = lambda _: False  # says whether the recipe normalises `reward` or `observation`
+    derived: dict[str, Any] = dataclasses.field(default_factory=dict)  # what several rules compute from the rest
     printed_lines: int = 0  # Lines that the environment of the first process wrote to stdout
     printed_first: str = ""
 

@@ -14,6 +14,7 @@ from rlctl.environments.success import SUCCESS
 WITH_SEARCH = ("comparisons", "episodes", "starts", "search")  # they play the first process's instance
 DISCOUNT = 0.99  # per step: what is hundreds of steps away hardly counts
 TERMS = "reward_terms/"
+WEIGHED = "episodes with weighed terms"
 RAW_TERMS = "metrics/"
 """The same without their weights, of tasks."""
 REWARD_WORDS = {"reward", "rewards", "rew", "rews"}
@@ -38,8 +39,12 @@ def require_readable(records: Records) -> list[CheckedEpisode]:
 
 
 def require_rewarded(records: Records) -> list[CheckedEpisode]:
-    """Return the same, if every reward is a finite number; with reward terms by `weigh_terms`."""
-    return weigh_terms(_require_finite(records))
+    """Return the same, if every reward is a finite number; with reward terms by `weigh_terms`, once for all rules."""
+    episodes = _require_finite(records)
+    if WEIGHED not in records.derived:
+        records.derived[WEIGHED] = weigh_terms(episodes)
+    weighed: list[CheckedEpisode] = records.derived[WEIGHED]
+    return weighed
 
 
 def _require_finite(records: Records) -> list[CheckedEpisode]:
@@ -77,7 +82,8 @@ def _choose_with_terms(episodes: Sequence[CheckedEpisode]) -> list[CheckedEpisod
 
 def weigh_terms(episodes: list[CheckedEpisode]) -> list[CheckedEpisode]:
     """Return episodes whose terms are the reward, where that can be had: terms without their weights get them, and are
-    `RAW_TERMS` too, as those of tasks; numbers of info that are named after the reward are terms if they add up."""
+    `RAW_TERMS` too, as those of tasks; numbers of info that are named after the reward, and those of any dictionary,
+    are terms if they add up."""
     if any(has_terms(episode) for episode in episodes):
         with_terms = [episode for episode in episodes if has_terms(episode)]
         is_raw = len(with_terms) == len(episodes) and find_wrong_sums(with_terms).any()
@@ -92,15 +98,20 @@ def weigh_terms(episodes: list[CheckedEpisode]) -> list[CheckedEpisode]:
 
 
 def _list_groups(episodes: Sequence[CheckedEpisode]) -> list[dict[str, str]]:
-    """Return the numbers of info that may be reward terms: new names by old ones, for each dictionary that is named
-    after the reward, and for single numbers that are."""
+    """Return the numbers of info that may be reward terms: new names by old ones, for each dictionary, and for single
+    numbers that are named after the reward. Those named after it come first."""
     groups: dict[str, dict[str, str]] = {}
+    others: dict[str, dict[str, str]] = {}
     for name in dict.fromkeys(name for episode in episodes for name in episode.infos):
         folder, _, term = name.rpartition("/")
         words = set(split_name(folder or term))
-        if words & REWARD_WORDS and not words & TOTAL_WORDS | set(split_name(term)) & TOTAL_WORDS:
+        is_named = bool(words & REWARD_WORDS)
+        is_total = bool(words & TOTAL_WORDS | set(split_name(term)) & TOTAL_WORDS)
+        if is_named and not is_total:
             groups.setdefault(folder, {})[name] = TERMS + term
-    return [group for group in groups.values() if len(group) > 1]
+        elif folder:
+            others.setdefault(folder, {})[name] = TERMS + term
+    return [group for group in [*groups.values(), *others.values()] if len(group) > 1]
 
 
 def _rename(episode: CheckedEpisode, names: Mapping[str, str]) -> CheckedEpisode:

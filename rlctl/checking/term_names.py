@@ -30,6 +30,12 @@ OPPOSITE_WORDS = {
 """What turns the meaning of the other words around."""
 
 
+TIME_WORDS = {"delay", "duration", "elapsed", "step", "steps", "time", "timestep"}
+GOAL_WORDS = {
+    "arrival", "arrived", "complete", "completed", "dist", "distance", "done", "finish", "finished", "goal", "progress",
+    "reach", "reached", "reaching", "success", "target", "waypoint", "waypoints",
+}  # fmt: skip
+"""What terms are named after where a task has an end that is to come soon."""
 STEPPING_WORDS = {"clearance", "airtime", "swing", "lift", "liftoff"}
 """What feet do while a robot walks, and not while it stands."""
 GRASP_WORDS = {"grasp", "grasped", "grasping", "grip", "gripping", "pinch", "hold", "holding", "clamp", "squeeze"}
@@ -52,6 +58,17 @@ def is_cost(name: str) -> bool:
     """Say whether a name calls the term a cost or a penalty."""
     words = set(split_name(name))
     return bool(words & COST_WORDS) and not words & OPPOSITE_WORDS
+
+
+def is_about_time(name: str) -> bool:
+    """Say whether a term is what each step costs, and nothing else."""
+    words = set(split_name(name))
+    return bool(words & TIME_WORDS) and words <= TIME_WORDS | COST_WORDS | {"per", "spent", "used"}
+
+
+def is_about_goals(name: str) -> bool:
+    """Say whether a term is about a place or a state that ends the task, or the next part of it."""
+    return bool(set(split_name(name)) & GOAL_WORDS)
 
 
 def is_error(name: str) -> bool:

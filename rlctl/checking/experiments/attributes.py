@@ -99,7 +99,7 @@ def log_attributes(context: Context) -> Iterator[ChildMessage]:
     if log is None:
         raise NotJudged("what it observes has more than one size (RL101), or nothing was played")
     yield Fact("attributes", log)
-    if any(is_paid(name) for name in log.infos):
+    if any("/" in name or is_paid(name) for name in log.infos):
         yield Fact(WEIGHED_TERMS, find_weighed_terms(instance.env))
         yield Fact(ACTION_TERMS, find_action_terms(instance.env))
 

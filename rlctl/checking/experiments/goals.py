@@ -33,13 +33,16 @@ SCALED_GOAL = "goal in a smaller unit"
 NEAR = 2e-3  # how near they are [m]
 PLACED_EPISODES, MOST_PLACED_EPISODES = 3, 8  # that are needed, and that are tried
 PLACED_STEPS = 3  # after which a goal is put at the place of the robot
-HELD_STEPS = 12  # after the first one, for which a goal may have to be held
+HELD_STEPS = 25  # after the first one, for which a goal may have to be held
+MOST_ARRIVALS = 3  # that a success may need, each at another goal
 STARTS_COMPARED = 9
 MOST_SOURCES = 24  # places in the observation at which it is put
+MOST_OTHERS = 40  # places of other things
 Numbers = NDArray[np.float64]
-Source = tuple[int, int]
+Source = tuple[int, ...]
 """The element of an observation from which on it has a place, and the sign with which the goal is in it; 0 for a place
-by itself, and `TURNED` for the way to the goal in the frame of a robot that turns."""
+by itself, and `TURNED` for the way to the goal in the frame of a robot that turns. A third number is the element from
+which on the observation has another place in the same frame, such as that of an object: that is then the place."""
 TURNED = 2
 TURN_SHIFT, TURN_ERROR = 0.1, 1e-3  # of a goal along each axis, to see how the observation turns it
 TURNS = (2 * np.pi, 360.0)  # one turn [rad, deg]
@@ -128,8 +131,10 @@ class GoalTrials:
 
     instance: Instance
     drawn: DrawnGoal
-    turned_places: dict[tuple[int, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
-    """Where the robot is by a turned source, by its element, seed, kind of actions and steps: goals move no robot."""
+    turned_places: dict[tuple[Source, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
+    """Where the robot is by a turned source, its seed, kind of actions and steps: goals move no robot."""
+    turnings: dict[tuple[int, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
+    """How the observation turns the way to the goal, by its element and the same."""
 
     @functools.cached_property
     def goals(self) -> Numbers:
@@ -174,35 +179,49 @@ class GoalTrials:
         """Where the observation has the place at which a goal is a success."""
         episode = GoalEpisode(self, FIRST_SEED, "repeated", PLACED_STEPS)
         reports_success = not episode.has_ended and episode.step().succeeds is not None
-        for source in self.list_sources(episode)[:MOST_SOURCES] if reports_success else ():
-            if self.is_success_at(source):
+        sources = self.list_sources(episode) if reports_success else []
+        # What rolls or falls may have to rest where it is held: the zero action.
+        tries = [(source, "repeated") for source in sources] + [(one, "zero") for one in sources if one[1]]
+        for source, actions in tries:
+            if self.is_success_at(source, actions):
                 return AtGoal(source, reports_success)
         return AtGoal(None, reports_success)
 
     def list_sources(self, episode: "GoalEpisode") -> list[Source]:
         """Return where the observation may have the place of the robot: relative to the goal, and then by itself."""
         plain = find_sources(self.drawn.copies, episode.observed[None], episode.goal[None])
-        return [*self.drawn.turned, *plain]
+        return [*self.drawn.turned, *plain][:MOST_SOURCES] + self._list_others(episode)
 
-    def is_success_at(self, source: Source) -> bool:
+    def _list_others(self, episode: "GoalEpisode") -> list[Source]:
+        """Return where it may have the place of something else, in a frame in which it has the goal."""
+        size, observed = episode.goal.size, episode.observed
+        found: list[Source] = []
+        for element, sign in [*self.drawn.turned, *self.drawn.copies]:
+            is_world = np.allclose(observed[element : element + size], sign * episode.goal, atol=ROUNDING)
+            for other in range(0 if is_world else observed.size - size + 1):
+                if abs(other - element) >= size:
+                    found.append((element, sign, other))
+        return found[:MOST_OTHERS]
+
+    def is_success_at(self, source: Source, actions: str = "repeated") -> bool:
         """Say whether a goal at a place of the observation is a success, in several episodes."""
         tried = 0
         for seed in range(FIRST_SEED, FIRST_SEED + MOST_PLACED_EPISODES):
-            place = self.find_place(source, seed)
+            place = self.find_place(source, seed, actions)
             if place is None:  # it ends, or succeeds, too early
                 continue
             # A place by itself may be anything: to hold the goal at each takes long.
-            if not self.succeeds(seed, place, source if source[1] else None):
+            if not self.succeeds(seed, place, source if source[1] else None, actions):
                 return False
             tried += 1
             if tried == PLACED_EPISODES:
                 return True
         return False
 
-    def find_place(self, source: Source, seed: int) -> Numbers | None:
-        """Return what is a place by a source, after a few steps with the action that the seed draws; None if the
-        episode ends or succeeds before."""
-        episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
+    def find_place(self, source: Source, seed: int, actions: str = "repeated") -> Numbers | None:
+        """Return what is a place by a source, after a few steps, by default with the action that the seed draws; None
+        if the episode ends or succeeds before."""
+        episode = GoalEpisode(self, seed, actions, PLACED_STEPS)
         if episode.has_ended or episode.has_succeeded or episode.step(episode.goal).succeeds:
             return None
         return episode.read(source)
@@ -217,10 +236,12 @@ class GoalTrials:
             places |= dict(zip(chain.names, chain.read()[:, self.drawn.place.axes], strict=True))
         return places
 
-    def succeeds(self, seed: int, goal: Numbers, source: Source | None = None) -> bool | None:
+    def succeeds(
+        self, seed: int, goal: Numbers, source: Source | None = None, actions: str = "repeated"
+    ) -> bool | None:
         """Say whether the last of these steps is a success with the goal at a place, or one of some later steps in
         which it stays as far from the place of the robot by a source; None if it is not played."""
-        episode = GoalEpisode(self, seed, "repeated", PLACED_STEPS)
+        episode = GoalEpisode(self, seed, actions, PLACED_STEPS)
         if episode.has_ended:
             return None
         return episode.hold(goal, source).succeeds
@@ -269,48 +290,60 @@ class GoalEpisode:
         return GoalStep(moment.reward_number, succeeds)
 
     def hold(self, goal: Numbers, source: Source | None = None) -> GoalStep:
-        """Step until a success, as some tasks want a goal to be held for a while: once, or, with a source, with the
-        goal as far from the robot as now."""
+        """Step until a success, as some tasks want a goal to be held for a while, or several of them: once, or, with a
+        source, with the goal as far from the robot as now."""
         away = goal - self.read(source) if source is not None else np.zeros(goal.size)
         step = self.step(goal)
-        for _ in range(HELD_STEPS if source is not None else 0):
-            if step.succeeds is not False or self.has_ended:
-                break
+        left, arrivals = HELD_STEPS if source is not None else 0, 0
+        while left and step.succeeds is False and not self.has_ended:
             assert source is not None
-            step = self.step(self.read(source) + away)
+            if self.has_moved_on and arrivals < MOST_ARRIVALS:
+                left, arrivals = HELD_STEPS, arrivals + 1
+                self.goal = self._place.read(self._instance.env)
+                step = self.step()
+            else:
+                step = self.step(self.read(source) + away)
+            left -= 1
         return step
+
+    @property
+    def has_moved_on(self) -> bool:
+        """Whether the environment has replaced the goal that the last step was given."""
+        return not np.array_equal(self._place.read(self._instance.env), self.goal)
 
     def read(self, source: Source) -> Numbers:
         """Return the place of the robot by a source, after a step. Shape (size,)."""
         if source[1] == TURNED:
-            return self._read_turned(source[0])
+            return self._read_turned(source)
         return read_place(source, self.observed[None], self.goal[None])[0]
 
-    def _read_turned(self, element: int) -> Numbers:
-        key = element, self._seed, self._actions, len(self._goals)
+    def _read_turned(self, source: Source) -> Numbers:
+        key = source, self._seed, self._actions, len(self._goals)
         if key not in self._trials.turned_places:
-            part = self.observed[element : element + self.goal.size]
-            way, *_ = np.linalg.lstsq(self.read_turn(element), part, rcond=None)
+            part = read_part(source, self.observed[None], self.goal.size)[0]
+            way, *_ = np.linalg.lstsq(self.read_turn(source[0]), part, rcond=None)
             self._trials.turned_places[key] = self.goal - way
         return self._trials.turned_places[key]
 
     def read_turn(self, element: int) -> Numbers:
         """Return how the observation turns the way to the goal, after a step. Shape (size, size). The same steps are
         played again with the goal of the last one shifted."""
-        parts = []
-        # The last one leaves the environment as this episode did.
-        for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
-            again = GoalEpisode(self._trials, self._seed, self._actions)
-            again.play([*self._goals[:-1], self.goal + shift])
-            parts.append(again.observed[element : element + self.goal.size])
-        *shifted, plain = parts
-        return (np.stack(shifted, axis=1) - plain[:, None]) / TURN_SHIFT
+        key = element, self._seed, self._actions, len(self._goals)
+        if key not in self._trials.turnings:
+            parts = []
+            # The last one leaves the environment as this episode did.
+            for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
+                again = GoalEpisode(self._trials, self._seed, self._actions)
+                again.play([*self._goals[:-1], self.goal + shift])
+                parts.append(again.observed[element : element + self.goal.size])
+            *shifted, plain = parts
+            self._trials.turnings[key] = (np.stack(shifted, axis=1) - plain[:, None]) / TURN_SHIFT
+        return self._trials.turnings[key]
 
     def measure_distance(self, source: Source) -> float:
         """Return how far the goal is from the robot by a source."""
-        element, sign = source
-        if sign:
-            return float(np.linalg.norm(self.observed[element : element + self.goal.size]))
+        if source[1]:
+            return float(np.linalg.norm(read_part(source, self.observed[None], self.goal.size)))
         return float(np.linalg.norm(self.read(source) - self.goal))
 
     def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
@@ -514,6 +547,12 @@ def find_sources(copies: Sequence[Source], rows: Numbers, goals: Numbers) -> lis
 
 def read_place(source: Source, rows: Numbers, goals: Numbers) -> Numbers:
     """Return the place of the robot. Shapes of rows: (n, elements), of goals and the result: (n, size)."""
-    element, sign = source
-    part = rows[:, element : element + goals.shape[1]]
+    sign, part = source[1], read_part(source, rows, goals.shape[1])
     return goals - sign * part if sign else part
+
+
+def read_part(source: Source, rows: Numbers, size: int) -> Numbers:
+    """Return what an observation has there: a place, or the way to the goal. Shapes (n, elements) and (n, size)."""
+    element, _, *others = source
+    part = rows[:, element : element + size]
+    return part - rows[:, others[0] : others[0] + size] if others else part

@@ -13,12 +13,13 @@ from rlctl.checking.rewards import (
     find_terms,
     find_wrong_sums,
     join_terms,
+    reports_success,
     require_enough,
     require_terms,
     summarize,
 )
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
-from rlctl.checking.term_names import is_about_actions, is_cost, is_error
+from rlctl.checking.term_names import is_about_actions, is_about_goals, is_about_time, is_cost, is_error
 
 RULE = Rule(
     "RL621",
@@ -28,8 +29,9 @@ RULE = Rule(
         A reward term that should lower the reward raises it: its weight is negative and the term too, or it has
         no minus; weights that info does not have are estimated from the rewards. The policy learns to seek what
         the term should prevent. Judged are terms of a task with a negative weight that are named after an error
-        or a cost; costs of actions that pay more for moving than for doing nothing; and, as an info, terms that
-        are called cost or penalty.
+        or a cost; costs of actions that pay more for moving than for doing nothing; a constant that is called a
+        cost, or is named after time where other terms are about a goal; and, as an info, other terms that are
+        called cost or penalty.
     """,
     fix="Return the term without a sign, such as a distance or a squared action, and put the sign in the weight.",
 )
@@ -43,9 +45,19 @@ def _find_paying_penalties(records: Records) -> Iterator[RuleFinding]:
     if find_wrong_sums(episodes).any():
         raise NotJudged("reward_terms do not add up to the reward (RL607)")
     raw_terms = join_terms(episodes, RAW_TERMS)
-    for name, values in join_terms(episodes).items():
-        always_pays = bool((values >= 0).all() and (values != values[0]).any())
-        if not always_pays:
+    terms = join_terms(episodes)
+    has_goal = reports_success(episodes) and any(is_about_goals(name) for name in terms)
+    for name, values in terms.items():
+        if not (values >= 0).all():
+            continue
+        if (values == values[0]).all():
+            if values[0] > 0 and (is_cost(name) or (has_goal and is_about_time(name))):
+                message = f"reward term {name!r} pays {values[0]:.6g} at every step of {summarize(episodes)}"
+                longest = records.require_built().max_steps or max(one.steps for one in episodes)
+                message += (
+                    f": an episode of {longest} steps earns {longest * values[0]:.4g} of it, and an early end less"
+                )
+                yield RuleFinding(RULE, message, {"term": name, "value": float(values[0]), "episodes": len(episodes)})
             continue
         message = f"reward term {name!r} raises the reward at every step of {summarize(episodes)}"
         if not values.all():

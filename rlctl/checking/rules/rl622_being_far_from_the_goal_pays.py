@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from rlctl.checking.experiments.goals import (
-    MOST_SOURCES,
     GoalEpisode,
     GoalTrials,
     Numbers,
@@ -23,10 +22,11 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The further away the goal is, the larger is the reward, to both sides; or every failure pays more than
-        success, which goes on; or a goal that goes away pays more than one that comes nearer. The check played
+        success, which goes on; or a goal that goes away pays more than one that comes nearer; or the reward rises
+        through the goal and beyond, as a sum of differences with their signs does. The check played
         the same steps again, and put the goal, or the command, where is_success is true, and at several
         distances from there. So the policy learns to keep away from the goal. Most often a sign is wrong, or an
-        error is paid instead of a function that falls with it.
+        error is paid instead of a function that falls with it, or differences are added instead of their sizes.
     """,
     fix="""
         Make the reward largest where the task is done: subtract the distance or the error, pay
@@ -42,6 +42,7 @@ RADII = (0.35, 0.7, 1.0)  # parts of the goals' range
 WAY_RADIUS, WAY = 0.7, 0.2
 """Parts of the goals' range, at which a goal is that comes nearer or goes away in a step, and of this distance."""
 MOST_TURN = 0.45  # part of a turn: an angle that is further away is nearer on the other side
+ALIKE = 0.05  # part of the largest rise of a reward, by which those of other episodes may differ
 LEAST = 1e-6  # differences of rewards that count, of their size
 
 
@@ -88,6 +89,73 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         if axes:
             yield describe(trials, axes, shown)
             return
+    axes, shown = _find_signed(trials, source, insides)
+    axes = [axis for axis in axes if moved[axis]]
+    if axes:
+        yield _describe_signed(trials, axes, shown)
+
+
+def _find_signed(
+    trials: GoalTrials, source: Source, insides: Mapping[int, _Outcome]
+) -> tuple[list[int], Sequence[float]]:
+    """Return the axes along which the rewards rise from one side of the goal to the other, by the same in all episodes,
+    and those of one: from the lowest to the highest, at distances of `RADII` to both sides. Shape (2 * len(RADII),)."""
+    found: list[int] = []
+    shown: Sequence[float] = ()
+    for axis in range(trials.goals.shape[1]):
+        profiles: list[Numbers] = []
+        for number in insides:
+            profile = _measure_profile(trials, source, number, axis)
+            if profile is None or (profiles and not _is_alike(profiles[0], profile)):
+                break
+            profiles.append(profile)
+        if len(profiles) == len(insides):
+            found.append(axis)
+            shown = profiles[0].tolist()
+    return found, shown
+
+
+def _measure_profile(trials: GoalTrials, source: Source, number: int, axis: int) -> Numbers | None:
+    """Return the rewards with the goal from one side of the robot to the other, if they rise: beyond it at each step,
+    and before it they may be limited. None if they do not, or if any is a success or the end. The sign of the side that
+    pays is the last number."""
+    outcomes = []
+    for radius in (*(-one for one in RADII[::-1]), *RADII):
+        offsets = np.zeros((LATER_STEPS, trials.goals.shape[1]))
+        offsets[:, axis] = radius * _find_room(trials, axis)
+        outcome = _measure(trials, source, number, offsets)
+        if outcome is None or outcome.succeeds or outcome.has_ended:
+            return None
+        outcomes.append(outcome.reward)
+    rewards = np.array(outcomes)
+    least = LEAST * max(1.0, float(np.abs(rewards).max()))
+    for sign in (1, -1):
+        steps = np.diff(rewards[::sign])
+        if steps.min() > -ALIKE * steps.max() and (steps[len(RADII) - 1 :] > least).all():
+            return np.array([*rewards[::sign], sign])
+    return None
+
+
+def _is_alike(one: Numbers, two: Numbers) -> bool:
+    """Say whether rewards rise by the same beyond the goal, and to the same side."""
+    beyond = slice(len(RADII), 2 * len(RADII))
+    rises = np.diff(one[beyond]), np.diff(two[beyond])
+    return bool(one[-1] == two[-1] and np.abs(rises[0] - rises[1]).max() < ALIKE * rises[0].max())
+
+
+def _describe_signed(trials: GoalTrials, axes: Sequence[int], shown: Sequence[float]) -> RuleFinding:
+    *rewards, sign = shown
+    away = RADII[-1] * _find_room(trials, axes[0])
+    near = RADII[0] * _find_room(trials, axes[0])
+    name = trials.drawn.name_axis(axes[0])
+    side = "below" if sign < 0 else "above"
+    message = f"the reward rises through the goal: {rewards[0]:.4g}, {rewards[len(RADII)]:.4g} and {rewards[-1]:.4g}"
+    message += (
+        f" with {name} {away:.3g} on one side of the place of a success, {near:.3g} {side} it and {away:.3g} {side} it"
+    )
+    message += f" ({_name_axes(trials, axes)}): a distance has no sign"
+    evidence = {"element": trials.drawn.name, "value": rewards[-1], "expected": f"below {rewards[len(RADII)]:.6g}"}
+    return RuleFinding(RULE, message, evidence)
 
 
 def _explain_few(count: int) -> str:
@@ -154,7 +222,7 @@ def _find_source(trials: GoalTrials) -> tuple[Source | None, bool]:
     """Return the part of the observation with the place that a goal has to have for a success; and whether success is
     reported at all."""
     episode, reports_success = _begin(trials, 0), False
-    for source in trials.list_sources(episode)[:MOST_SOURCES]:
+    for source in trials.list_sources(episode):
         if episode.has_ended:
             episode = _begin(trials, 0)
         for step in episode.play([episode.read(source)]):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rlctl.checking.experiments.goals import (
-    MOST_SOURCES,
+    HELD_STEPS,
     PLACED_STEPS,
     GoalEpisode,
     GoalTrials,
@@ -53,7 +53,7 @@ def _find_counted_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         yield Skipped(RULE.id, "episodes are too short, or begin with a success", applies=False)
         return
     known = trials.at_goal.source
-    for source in trials.list_sources(episode)[:MOST_SOURCES] if known is None else [known]:
+    for source in trials.list_sources(episode) if known is None else [known]:
         switches: list[_Switch] = []
         for seed in range(FIRST_SEED, FIRST_SEED + MOST_EPISODES):
             switch = _play(trials, source, shown, seed)
@@ -78,21 +78,26 @@ def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Swit
     if episode.has_ended or not np.array_equal(trials.drawn.place.read(trials.instance.env), episode.goal):
         return None  # it has gone on to another goal already
     is_absolute = np.allclose(_read(episode, shown), episode.goal, atol=1e-4)
-    place = episode.read(source)
-    episode.step(place)
-    way = 0.0 if episode.has_ended else _measure_way(episode, shown, place, is_absolute=is_absolute)
+    for _ in range(1 + (HELD_STEPS if source[1] else 0)):  # a place by itself may be anything: it is not held
+        place = episode.read(source)
+        # From where the observation has the way to the goal: the robot, or what carries it.
+        begin = np.zeros(place.size) if is_absolute else episode.read(shown)
+        episode.step(place)
+        seen = _read(episode, shown)
+        off = float(np.linalg.norm(seen - place)) if is_absolute else float(np.linalg.norm(seen))
+        expected = 0.0 if is_absolute else float(np.linalg.norm(place - begin))
+        is_another = episode.has_moved_on or abs(off - expected) > LEAST_WAY * float(np.linalg.norm(trials.range))
+        if episode.has_ended or is_another:
+            break
+    if episode.has_ended or not is_another:
+        return None
+    way = episode.measure_distance(source) if source[1] and not is_absolute else off
     if way < LEAST_WAY * float(np.linalg.norm(trials.range)):
         return None
     rewards = np.array([step.reward for step in episode.play([None] * 4)])
     if len(rewards) < 4 or not np.isfinite(rewards).all():
         return None
     return _Switch(way, float(rewards[0] - np.median(rewards[1:])), float(np.ptp(rewards[1:])))
-
-
-def _measure_way(episode: GoalEpisode, shown: Source, place: Numbers, *, is_absolute: bool) -> float:
-    """Return how far the goal that is observed now is from the place at which it was put."""
-    block = _read(episode, shown)
-    return float(np.linalg.norm(block - place if is_absolute else block))
 
 
 def _read(episode: GoalEpisode, shown: Source) -> Numbers:
