@@ -169,8 +169,9 @@ def _find_of_size(
         shows = [any(first <= column < first + size for column in turn.columns) for first in firsts]
         wrong[number, :, shows, :] = 1.0
         wrong[number, :, :, shows] = 1.0
-    left = wrong.min(axis=(0, 1))
-    is_found = (left < FITS) & (right.min(axis=(0, 1)) > np.maximum(MISFITS, CLEARLY * left))
+    left, best = wrong.min(axis=(0, 1)), right.min(axis=(0, 1))
+    has_none = best.min(axis=1) > FITS  # of the observed velocities, in its frame: joint angles have their own
+    is_found = (left < FITS) & (best > np.maximum(MISFITS, CLEARLY * left)) & has_none[:, None]
     for one, two in np.argwhere(is_found).tolist():
         place, velocity = firsts[one], firsts[two]
         number, power = divmod(int(wrong[:, :, one, two].argmin()), wrong.shape[1])
