@@ -44,6 +44,7 @@ FOLDER = Path("build/mujoco-scores")
 BUDGETS = (200_000, 1_000_000)
 EVERY = 20_000  # steps between evaluations
 LAST_EPISODES = 100  # of the policy at the end
+KEPT = ", best policy"  # of the evaluations during the training: the one that rlctl plays and exports
 _LEAST_FOR_INTERVAL = 5  # seeds
 
 PUBLISHED = {  # return on v4 after `BUDGETS`: means of ten seeds, from the curves that the authors publish
@@ -172,11 +173,17 @@ def read_run(folder: Path, cores: int) -> list[Row]:
         raise RuntimeError(f"{folder}: the training has not finished")
     shared = status["task"], f"rlctl {recipe.algo}", read_version("rlctl"), recipe.seed, recipe.total_timesteps
     curve = [(int(row["steps"]), float(row["return"]), float(row["seconds"]) / 60) for row in read_csv(run.evals_file)]
+    shown = _describe_command(status, recipe)
+    trained = _make_rows(shared, curve, _evaluate(folder, "last"), cores, shown)
+    best = dataclasses.replace(trained[-1], tool=f"{trained[-1].tool}{KEPT}", score=round(_evaluate(folder, "best"), 1))
+    return [*trained, best]
+
+
+def _evaluate(folder: Path, checkpoint: str) -> float:
     with tempfile.NamedTemporaryFile(suffix=".json") as file:
-        options = ["--checkpoint", "last", "--episodes", str(LAST_EPISODES), "--json", file.name]
+        options = ["--checkpoint", checkpoint, "--episodes", str(LAST_EPISODES), "--json", file.name]
         rlctl_command("eval", str(folder.resolve()), *options)
-        last = json.loads(Path(file.name).read_text())["return"]["mean"]
-    return _make_rows(shared, curve, last, cores, _describe_command(status, recipe))
+        return float(json.loads(Path(file.name).read_text())["return"]["mean"])
 
 
 def _describe_command(status: dict[str, Any], recipe: Recipe) -> str:
@@ -197,7 +204,8 @@ def write_page(rows: list[Row]) -> None:
         f"Written by `python -m tests.benchmarks.mujoco_scores` on {describe_machine()}, from [every evaluation]"
         f"({ROWS.name}) of what was trained so far, of all seeds: interquartile mean of the seeds' mean",
         f"returns of {LAST_EPISODES} episodes of the policy at the end, its 95 % interval from {_LEAST_FOR_INTERVAL}",
-        f"seeds on, else their range; before the end, in the picture, {EPISODES} episodes.",
+        f"seeds on, else their range; before the end, in the picture, {EPISODES} episodes. *Best policy*: that of the",
+        "best evaluation, which rlctl keeps, plays and exports; its return is of new episodes.",
         "A training learns for as many steps as its budget. *Published* are means of ten seeds on v4, computed from",
         "the curves of the authors, most with networks many times as wide.\n",
         f"![return over steps](pictures/{PICTURE.name})",
@@ -245,6 +253,7 @@ def draw(rows: list[Row], target: Path) -> None:
     """Draw the return over steps, a panel per robot and a line per training."""
     from matplotlib.figure import Figure
 
+    rows = [row for row in rows if not row.tool.endswith(KEPT)]
     environments, tools = sorted({row.environment for row in rows}), sorted({row.tool for row in rows})
     columns = min(3, len(environments))
     height = -(-len(environments) // columns)
@@ -268,7 +277,8 @@ def read_rows() -> list[Row]:
 
 def keep(trained: list[Row]) -> None:
     """Add the evaluations of a training to those that are kept, instead of those of an earlier equal training."""
-    rows = [row for row in read_rows() if row.training != trained[0].training] + trained
+    known = {row.training for row in trained}
+    rows = [row for row in read_rows() if row.training not in known] + trained
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(field.name for field in dataclasses.fields(Row))
