@@ -12,6 +12,7 @@ H = DT / PARTS
 class Airship(Robot):
     """It flies to a place, and observes with noise, in a dictionary, also how much of the time is left."""
 
+    rlctl_ignore = {"RL611": "chance does not reach its place"}
     limit = 120
 
     def __init__(self):
@@ -128,6 +129,8 @@ class RL826PressSlowClock(Press):
 
 
 class RL832PressSlidesFast(Press):
+    rlctl_ignore = {"RL603": "a consequence"}
+
     def slide_times(self):
         return np.array([1 / self.physics_hz, self.control_s])
 
