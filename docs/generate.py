@@ -55,7 +55,8 @@ policy was trained with.
 Defaults marked *rlctl* are chosen by rlctl; all others are those of Stable-Baselines3.
 
 `--config presets/NAME` uses a recipe that comes with rlctl. It overrides the task's own recipe, as a file does. A
-Gymnasium id has the preset of its name as its own recipe: `rlctl train Reacher-v5` trains by `presets/reacher-v5`.
+Gymnasium id has the preset of its name, or of another version of it, as its own recipe: `rlctl train Reacher-v5` trains
+by `presets/reacher-v5`.
 
 {presets}
 

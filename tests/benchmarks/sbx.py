@@ -56,7 +56,10 @@ class _Training:
 
     @property
     def settings(self) -> dict[str, Any]:
-        return {**OFF_POLICY, "gradient_steps": self.updates, "policy_delay": self.policy_delay}
+        settings = {**OFF_POLICY, "gradient_steps": self.updates, "policy_delay": self.policy_delay}
+        if self.algo == "CrossQ":
+            del settings["tau"]  # it has no target networks
+        return settings
 
 
 def _row(training: _Training, repeat: int) -> Row:

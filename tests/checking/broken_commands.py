@@ -81,7 +81,7 @@ class RL128PuckIsSentNorth(PuckIsSent):
 class AirshipIsSent(Commanded, Airship):
     """Without an engine, in a dictionary, without noise."""
 
-    rlctl_ignore = {"RL611": "it follows a velocity for ever"}
+    rlctl_ignore = {"RL611": "it follows a velocity without end"}
 
     def start(self):
         super().start()

@@ -263,11 +263,11 @@ def _find_literals(env: Any) -> set[float]:
     found: set[float] = set()
     for tree in parse_sources(env).values():
         nodes = list(ast.walk(tree))
-        frequencies = {id(node.right) for node in nodes if isinstance(node, ast.BinOp) and _is_time(node)}
+        frequencies = {id(node.right) for node in nodes if isinstance(node, ast.BinOp) and _is_fraction(node)}
         values = [node.value for node in nodes if isinstance(node, ast.Constant) and id(node) not in frequencies]
         found |= {abs(float(value)) for value in values if isinstance(value, int | float) and _is_number(value)}
     return found
 
 
-def _is_time(node: ast.BinOp) -> bool:
+def _is_fraction(node: ast.BinOp) -> bool:
     return isinstance(node.op, ast.Div) and isinstance(node.left, ast.Constant)

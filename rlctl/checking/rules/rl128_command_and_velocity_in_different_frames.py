@@ -13,6 +13,8 @@ from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import (
     IN_WORLD,
+    MOST_ELEMENTS,
+    MOST_TURNS,
     RIGHT,
     WRONG,
     Turn,
@@ -42,7 +44,6 @@ RULE = Rule(
 )
 
 SIZE = 2  # of a command and of a velocity
-MOST_ELEMENTS, MOST_TURNS = 40, 12
 FALLS, OTHERWISE = 0.995, 0.97
 """Rank correlation of what is paid and of the difference that it falls with, at least; and of any other, at most."""
 KEPT = 0.9  # part of the steps in which a command stays

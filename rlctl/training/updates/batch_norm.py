@@ -167,7 +167,7 @@ class NormalizedMlpStack(MlpStack):
     ) -> None:
         """As `MlpStack.backpropagate`; `latent` is the gradient of the last layer's normalized inputs."""
         assert isinstance(values, _Passed)
-        hidden = self._get_buffers("gradients", len(values[0][0]))
+        hidden = self._get_buffers("gradients", values[0].shape[1])
         for index in reversed(range(len(self._weights))):
             rows = gradient.shape[1]
             normalized, weight, norm = values.normalized[index], self._weights[index], self._norms[index]
