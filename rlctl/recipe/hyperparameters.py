@@ -14,6 +14,7 @@ LINEAR = "lin_"
 ON_POLICY = frozenset({"ppo", "a2c", "recurrent_ppo"})
 
 _Fraction = Annotated[Number, Field(ge=0, le=1)]
+_ShareBelow1 = Annotated[Number, Field(ge=0, lt=1)]
 _PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 _NotNegative = Annotated[Number, Field(ge=0)]
 _Positive = Annotated[Number, Field(gt=0)]
@@ -128,6 +129,8 @@ class _OffPolicy(_Learning):
 class _Continuous(_OffPolicy):
     action_noise: _NotNegative | None = None
     """Standard deviation of normal noise on actions scaled to [-1, 1]; null: none."""
+    actor_average: _ShareBelow1 = 0.0
+    """Decay per gradient step of the averaged actor that is evaluated, kept and exported; 0: the last one is."""
 
 
 class _MaximumEntropy(_Continuous):
@@ -179,6 +182,7 @@ class Xqc(CrossQ):
     """
 
     ent_coef: _EntropyCoefficient = "auto_0.01"
+    actor_average: _ShareBelow1 = 0.9997
 
 
 class Ddpg(_Continuous):

@@ -169,7 +169,7 @@ def check_spaces(algo: str, observation_space: spaces.Space[Any], action_space: 
 
 
 def _algorithm_kwargs(recipe: Recipe) -> dict[str, Any]:
-    ours = ("action_noise", "policy_delay") if recipe.algo in _DELAYED_BY_US else ("action_noise",)  # SB3 gets neither
+    ours = {"action_noise", "actor_average", *(("policy_delay",) if recipe.algo in _DELAYED_BY_US else ())}
     return {name: _make_schedule(value) for name, value in recipe.algo_kwargs.items() if name not in ours}
 
 

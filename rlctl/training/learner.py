@@ -145,7 +145,8 @@ class Learner:
     def pack(self) -> PolicyFile:
         """Return the current policy, with the last stage of the curriculum as its environment."""
         policy = pack(self.model, self.recipe.algo, self.curriculum.goal_spec, self.curriculum.goal)
-        return policy.with_info(stages=self.curriculum.specs)
+        tensors = {**policy.tensors, **self.rollouts.list_averages()}
+        return dataclasses.replace(policy, tensors=tensors).with_info(stages=self.curriculum.specs)
 
     def begin_next_stage(self) -> tuple[str, str]:
         """Cut the running episodes short and begin the next stage; return its title and the reason."""

@@ -18,8 +18,10 @@ from rlctl.policy.actor import Exploration
 from rlctl.policy.file import DETERMINISTIC
 from rlctl.recipe.hindsight import find_problem
 from rlctl.recipe.recipe import Hindsight, Recipe
+from rlctl.training.averaging import ActorAverage
 from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Rollouts, SegmentWatch, WorkerVecEnv, to_network_layout
+from rlctl.training.snapshot import Tensors
 
 
 class OffPolicyRollouts(Rollouts):
@@ -35,6 +37,7 @@ class OffPolicyRollouts(Rollouts):
         self.overlap = recipe.overlap and recipe.her is None
         default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # deterministic actors need noise to explore
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
+        self._average = ActorAverage(model, float(recipe.algo_kwargs.get("actor_average", 0.0)))
 
     def start(self) -> None:
         """Send the policy to the workers and let them play `train_freq` steps."""
@@ -86,6 +89,19 @@ class OffPolicyRollouts(Rollouts):
             if updates > 0:
                 self._updater.train(batch_size=model.batch_size, gradient_steps=updates)
                 self.rehearse(updates)
+                self._average.follow(updates)
+
+    def list_averages(self) -> Tensors:
+        """As `Rollouts.list_averages`: of the actor."""
+        return self._average.list_tensors()
+
+    def take(self) -> tuple[Tensors, Any]:
+        """As `Rollouts.take`."""
+        return self._average.take(), None
+
+    def restore(self, tensors: Tensors, plain: Any) -> None:
+        """As `Rollouts.restore`."""
+        self._average.restore(tensors)
 
 
 _LEARNING_STARTS = 100  # SB3's own default, of every algorithm

@@ -279,6 +279,10 @@ class Rollouts(abc.ABC):
     def learn(self) -> None:
         """Do the updates due for the stored segments."""
 
+    def list_averages(self) -> Tensors:
+        """Return the policy's tensors that are averages over updates, by the names of policy files."""
+        return {}
+
     def take(self) -> tuple[Tensors, Any]:
         """Return what a checkpoint needs beside the model: tensors and plain data."""
         return {}, None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rlctl.policy.file import ACTOR_CRITIC
 from rlctl.policy.torch_policy import ACTIVATIONS
 from rlctl.policy.torch_policy import ALGORITHMS as CLASSES
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
@@ -58,7 +59,8 @@ def test_every_algorithm_has_its_models():
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_names_and_defaults_are_those_of_the_classes(algo):
     cls = CLASSES[algo]
-    ours = {"policy_delay": 1} if algo in ("sac", "tqc") else {}
+    ours = {"actor_average": 0.9997 if algo == "xqc" else 0.0} if algo in ACTOR_CRITIC else {}
+    ours |= {"policy_delay": 1} if algo in ("sac", "tqc") else {}
     assert of_model(ALGORITHM_PARAMETERS[algo]) == defaults(cls, NOT_FOR_RECIPES) | ours
     for policy in cls.policy_aliases.values():
         assert of_model(NETWORK_PARAMETERS[algo]) == defaults(policy, NOT_FOR_POLICIES)
