@@ -313,6 +313,11 @@ def _find_effective(recipe: Recipe, values: Mapping[str, Any], key: str) -> Any:
     return NOT_SET if field is None else field.default
 
 
+def fill_parameters(recipe: Recipe) -> dict[str, Any]:
+    """Return the parameters of a recipe's algorithm, with the defaults of those that it leaves out."""
+    return ALGORITHM_PARAMETERS[recipe.algo].model_validate(recipe.algo_kwargs).model_dump()
+
+
 def find_mixed(recipes: Sequence[Recipe]) -> list[str]:
     """Return the dotted keys in which the recipes differ."""
     return sorted({key for recipe in recipes[1:] for key in find_difference(recipe, recipes[0])})

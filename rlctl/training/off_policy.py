@@ -17,7 +17,7 @@ from rlctl.errors import RecipeError
 from rlctl.policy.actor import Exploration
 from rlctl.policy.file import DETERMINISTIC
 from rlctl.recipe.hindsight import find_problem
-from rlctl.recipe.recipe import Hindsight, Recipe
+from rlctl.recipe.recipe import Hindsight, Recipe, fill_parameters
 from rlctl.training.averaging import ActorAverage
 from rlctl.training.progress import Progress
 from rlctl.training.rollouts import Rollouts, SegmentWatch, WorkerVecEnv, to_network_layout
@@ -37,7 +37,7 @@ class OffPolicyRollouts(Rollouts):
         self.overlap = recipe.overlap and recipe.her is None
         default = 0.1 if recipe.algo in DETERMINISTIC else 0.0  # deterministic actors need noise to explore
         self._action_noise = float(recipe.algo_kwargs.get("action_noise", default) or 0.0)
-        self._average = ActorAverage(model, float(recipe.algo_kwargs.get("actor_average", 0.0)))
+        self._average = ActorAverage(model, fill_parameters(recipe).get("actor_average", 0.0))
 
     def start(self) -> None:
         """Send the policy to the workers and let them play `train_freq` steps."""

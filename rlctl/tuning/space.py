@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from rlctl.environments.spec import merge
 from rlctl.errors import UsageError
-from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS, LINEAR, ON_POLICY, split_schedule
-from rlctl.recipe.recipe import Recipe
+from rlctl.recipe.hyperparameters import LINEAR, ON_POLICY, split_schedule
+from rlctl.recipe.recipe import Recipe, fill_parameters
 from rlctl.storage import yaml_text
 
 if TYPE_CHECKING:
@@ -125,11 +125,6 @@ def list_usual_steps(recipe: Recipe) -> list[list[Dimension]]:
 def list_values(recipe: Recipe) -> dict[str, Any]:
     """Return the keys and values of a recipe as plain data, with the defaults of its algorithm."""
     return recipe.model_dump(mode="json", by_alias=True) | {"algo_kwargs": fill_parameters(recipe)}
-
-
-def fill_parameters(recipe: Recipe) -> dict[str, Any]:
-    """Return the parameters of a recipe's algorithm, with the defaults of those that it leaves out."""
-    return ALGORITHM_PARAMETERS[recipe.algo].model_validate(recipe.algo_kwargs).model_dump()
 
 
 def _vary_learning_rate(value: Any) -> Dimension:

@@ -17,12 +17,12 @@ from rlctl.environments.spec import merge
 from rlctl.errors import ArtifactError, TaskError, UsageError, explain_missing_package
 from rlctl.launching.trainings import MakeTrainings, make_local_trainings
 from rlctl.recipe.hyperparameters import ON_POLICY
-from rlctl.recipe.recipe import Recipe
+from rlctl.recipe.recipe import Recipe, fill_parameters
 from rlctl.recipe.sources import find_config, resolve_with_stages
 from rlctl.runs.directory import RunLock, create_group_folder
 from rlctl.runs.train_request import TrainRequest
 from rlctl.training.start import find_start, preserve_process_state
-from rlctl.tuning.space import Dimension, fill_parameters, list_usual_steps, list_values, nest, parse_search
+from rlctl.tuning.space import Dimension, list_usual_steps, list_values, nest, parse_search
 from rlctl.tuning.tune_request import TuneRequest
 from rlctl.tuning.tuning import Trial, Tuning, find, load
 

@@ -30,7 +30,7 @@ from rlctl.errors import RlctlError
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.play.workers import available_cores
 from rlctl.recipe import sources
-from rlctl.recipe.recipe import Recipe
+from rlctl.recipe.recipe import Recipe, fill_parameters
 from rlctl.runs.compare.significance import interquartile_mean_interval
 from rlctl.runs.directory import RunDirectory
 from rlctl.storage import files
@@ -45,6 +45,7 @@ BUDGETS = (200_000, 1_000_000)
 EVERY = 20_000  # steps between evaluations
 LAST_EPISODES = 100  # of the policy at the end
 KEPT = ", best policy"  # of the evaluations during the training: the one that rlctl plays and exports
+NOT_AVERAGED = ", last weights"  # evaluated instead of their average
 _LEAST_FOR_INTERVAL = 5  # seeds
 
 PUBLISHED = {  # return on v4 after `BUDGETS`: means of ten seeds, from the curves that the authors publish
@@ -171,7 +172,8 @@ def read_run(folder: Path, cores: int) -> list[Row]:
     status, recipe = run.status(), run.recipe()
     if status.get("status") != "finished":
         raise RuntimeError(f"{folder}: the training has not finished")
-    shared = status["task"], f"rlctl {recipe.algo}", read_version("rlctl"), recipe.seed, recipe.total_timesteps
+    tool = f"rlctl {recipe.algo}" + ("" if fill_parameters(recipe).get("actor_average") else NOT_AVERAGED)
+    shared = status["task"], tool, read_version("rlctl"), recipe.seed, recipe.total_timesteps
     curve = [(int(row["steps"]), float(row["return"]), float(row["seconds"]) / 60) for row in read_csv(run.evals_file)]
     shown = _describe_command(status, recipe)
     trained = _make_rows(shared, curve, _evaluate(folder, "last"), cores, shown)

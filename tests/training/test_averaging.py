@@ -48,10 +48,11 @@ def test_without_decay_there_is_none():
 
 
 @pytest.mark.slow
-def test_the_training_is_the_same_and_the_policy_is_the_average(train):
+@pytest.mark.parametrize(("algo", "average"), [("sac", {"actor_average": 0.99}), ("xqc", {})])
+def test_the_training_is_the_same_and_the_policy_is_the_average(train, algo, average):
     plain, averaged = (
-        train("Line", settings("sac", eval={"every_steps": 1_000}, algo_kwargs={"actor_average": decay})).run
-        for decay in (0.0, 0.99)
+        train("Line", settings(algo, eval={"every_steps": 1_000}, algo_kwargs=changes)).run
+        for changes in ({"actor_average": 0.0}, average)
     )
     drop = ("seconds", "fps", "time")
     first, second = (
