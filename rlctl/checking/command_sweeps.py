@@ -22,6 +22,7 @@ NEAR = (0.0, 0.3, 0.7, 1.2, 2.5)  # how far from the middle of the drawn range, 
 FAR = (5.0, 10.0, 20.0)  # the same, where nothing nearer pays most
 SECTIONS = 14  # golden ones, of the interval around the best value
 GOLDEN = (np.sqrt(5) - 1) / 2
+SMALL = 0.05  # part of that interval in which rewards may round to the same
 SAME = 1e-12  # relative error of rewards
 STRAIGHT = 1e-6  # part of the change of a reward by which a line may be missed
 DRAWN = 9  # resets, whose commands give the range
@@ -166,7 +167,8 @@ def _find_best(pay: Callable[[float], float], values: Array, rewards: Array) -> 
     paid_one, paid_two = pay(one), pay(two)
     for _ in range(SECTIONS):
         if paid_one == paid_two:
-            return np.nan  # several pay the same
+            is_small = high - low < SMALL * (values[place + 1] - values[place - 1])
+            return (low + high) / 2 if is_small else np.nan  # float32 rounds, or several pay the same
         if paid_one > paid_two:
             high, two, paid_two = two, one, paid_one
             one = high - GOLDEN * (high - low)
