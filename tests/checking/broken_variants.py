@@ -144,4 +144,6 @@ class RL014WeighsTheStand(Reach):
 
 @dataclass
 class RL014ActsTooLate(Reach):
-    events = {"gust": Event("interval", events.push, every_s=30.0, body="arm", link="lbr_iiwa_link_6", force=(0.0, 1.0))}
+    events = {
+        "gust": Event("interval", events.push, every_s=30.0, body="arm", link="lbr_iiwa_link_6", force=(0.0, 1.0))
+    }

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import EPISODES, AttributeLog, Numbers
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
+from rlctl.checking.feet import find_feet, read_touches
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import find_rates
@@ -37,7 +38,6 @@ STILL = 0.04  # part of the speeds in other episodes
 SLOW = 0.05  # speeds that are as good as none [rad/s], [m/s]
 MUCH = 0.2  # part of what the term pays at most
 MOST_PAID = 0.95  # quantile of what it pays
-OFTEN = 0.05  # part of the looks in which a link touches something, so that it may be a foot
 FEWEST_STAYS, FEWEST_LANDINGS = 30, 6  # steps
 ALIKE = 0.9  # part of the steps in which feet stay, in which each pays the same
 EXACT = 1e-6  # relative error of what is paid
@@ -56,7 +56,10 @@ def _find_paid_standing(records: Records) -> Iterator[RuleFinding]:
     looks = [rows for rows in looks if len(rows) == LOOKED]
     if len(looks) < len(episodes):
         raise NotJudged("the robot does not come to rest with the zero action")
+    known = {finding.evidence.get("term") for finding in records.findings if finding.rule == RULE.id}
     for name, values in terms.items():
+        if name in known:
+            continue
         paid = np.array([values[rows].mean() for rows in looks])
         most = float(np.nanquantile(values, MOST_PAID))
         shown = f"{paid.mean():.3g} in each step while nothing moves"
@@ -107,18 +110,9 @@ def _find_paid_contacts(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 
 def _read_feet(world: LoggedWorld) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which links of robots touch other bodies before and after each step. Shape (steps, links) each."""
-    robots = {body.id for body in world.world.bodies if body.joints}
-    looks = [
-        [{link for pair in pairs if pair[0][0] != pair[1][0] for link in pair} for pairs in log.touching]
-        for log in world.logs
-        if len(log.touching) > 1
-    ]
-    every = [links for log in looks for links in log]
-    links = sorted({link for touched in every for link in touched if link[0] in robots and link[1] >= 0})
-    feet = [link for link in links if np.mean([link in touched for touched in every]) >= OFTEN]
-    rows = [np.array([[foot in touched for foot in feet] for touched in log], np.bool_) for log in looks]
-    nothing = np.zeros((0, len(feet)), np.bool_)
-    return np.concatenate([nothing, *(row[:-1] for row in rows)]), np.concatenate([nothing, *(row[1:] for row in rows)])
+    feet = find_feet(world)
+    rows = [np.zeros((1, len(feet)), np.bool_), *(read_touches(log, feet) for log in world.logs)]
+    return np.concatenate([row[:-1] for row in rows]), np.concatenate([row[1:] for row in rows])
 
 
 def _find_paid_each(values: Numbers, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> float | None:
