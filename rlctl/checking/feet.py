@@ -28,4 +28,6 @@ def list_touched(log: WorldLog, look: int) -> set[Link]:
 def read_touches(log: WorldLog, links: Sequence[Link]) -> NDArray[np.bool_]:
     """Return which of some links touch another body at each look. Shape (looks, links)."""
     looks = [list_touched(log, look) for look in range(len(log.touching))]
-    return np.array([[link in touched for link in links] for touched in looks], np.bool_).reshape(-1, len(links))
+    return np.array([[link in touched for link in links] for touched in looks], np.bool_).reshape(
+        len(looks), len(links)
+    )

@@ -37,6 +37,7 @@ LEVEL, UPRIGHT = 0.5, 0.8  # sine of the most and the least angle of an axis to 
 DEGREES = 180 / np.pi
 EXACT = 0.01  # relative error of a factor
 TURN = 2 * np.pi  # [rad/s]; commands in radians are smaller, commands in degrees larger
+ROUNDED = 3e-3  # part of the range of a command by which the best one may be missed
 OBSERVED = 0.9  # correlation of an observed number, perhaps with noise
 
 
@@ -49,6 +50,7 @@ class _Motions(NamedTuple):
     rates: Array  # The same
     yaw_rate: Array  # About the vertical. Shape (n,)
     observed: Array  # Shape (n, elements)
+    error: float  # of the best commands
 
 
 @judges_commands(RULE)
@@ -74,7 +76,9 @@ def _find_other_motions(trials: CommandTrials) -> Iterator[ChildMessage]:
 
 
 def _read(sweep: CommandSweep | None) -> _Motions | None:
-    moments = [moment for moment in sweep.moments if np.isfinite(moment.best)] if sweep is not None else []
+    if sweep is None:
+        return None
+    moments = [moment for moment in sweep.moments if np.isfinite(moment.best)]
     bases = [moment.base for moment in moments if moment.base is not None]
     if len(bases) < max(FEWEST, len(moments)) or len({moment.observed.shape for moment in moments}) != 1:
         return None
@@ -84,7 +88,8 @@ def _read(sweep: CommandSweep | None) -> _Motions | None:
         for name in ("velocity", "rates")
     )
     best, observed = (np.array([getattr(moment, name) for moment in moments]) for name in ("best", "observed"))
-    return _Motions(best, turn, velocity, rates, np.array([base.rates[2] for base in bases]), observed)
+    error = ROUNDED * float(np.ptp(sweep.drawn))
+    return _Motions(best, turn, velocity, rates, np.array([base.rates[2] for base in bases]), observed, error)
 
 
 def _fit(best: Array, motion: Array) -> tuple[float, float]:
@@ -158,6 +163,11 @@ def _find_swapped(place: DrawnPlace, motions: dict[DrawnPlace, _Motions]) -> str
     found = motions[place]
     for other, ahead in motions.items():
         is_later = other.name == place.name and other.elements[0] > place.elements[0]
-        if is_later and _is(found.best, found.velocity[:, 1]) and _is(ahead.best, ahead.velocity[:, 0]):
+        is_aside = np.abs(found.best - found.velocity[:, 1]).max() <= found.error
+        if is_later and is_aside and _is(ahead.best, ahead.velocity[:, 0]) and _differs(found, found.velocity[:, 0]):
             return f"the speed to the side (y of the base), and that of {other.name}[{other.elements[0]}] the one ahead"
     return ""
+
+
+def _differs(found: _Motions, motion: Array) -> bool:
+    return bool(np.abs(found.best - motion).max() > 10 * found.error)
