@@ -93,9 +93,12 @@ def _read(sweep: CommandSweep | None) -> _Motions | None:
 
 
 def _fit(best: Array, motion: Array) -> tuple[float, float]:
-    """Return by which factor a motion is the best command, and which part of its deviation the rest is."""
+    """Return by which factor a motion is the best command, and which part of its deviation the rest is. The moment that
+    it misses most is left out: not every contact is the same again."""
     if motion.std() < LEAST:
         return 0.0, np.inf
+    kept = np.argsort(np.abs(best - float(best @ motion / (motion @ motion)) * motion))[:-1]
+    best, motion = best[kept], motion[kept]
     factor = float(best @ motion / (motion @ motion))
     return factor, float((best - factor * motion).std() / max(best.std(), LEAST))
 
@@ -163,7 +166,7 @@ def _find_swapped(place: DrawnPlace, motions: dict[DrawnPlace, _Motions]) -> str
     found = motions[place]
     for other, ahead in motions.items():
         is_later = other.name == place.name and other.elements[0] > place.elements[0]
-        is_aside = np.abs(found.best - found.velocity[:, 1]).max() <= found.error
+        is_aside = bool(np.sort(np.abs(found.best - found.velocity[:, 1]))[-2] <= found.error)
         if is_later and is_aside and _is(ahead.best, ahead.velocity[:, 0]) and _differs(found, found.velocity[:, 0]):
             return f"the speed to the side (y of the base), and that of {other.name}[{other.elements[0]}] the one ahead"
     return ""
