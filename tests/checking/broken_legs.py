@@ -77,7 +77,7 @@ class Leg(gym.Env):
         return paid
 
     def step(self, action):
-        action = np.clip(np.asarray(action, float), -1, 1)
+        action = np.clip(np.nan_to_num(np.asarray(action, float)), -1, 1)
         self.data.ctrl[:] = HOLD * (STANCE + 0.6 * action)[list(self.order)]
         for _ in range(5):
             mujoco.mj_step(self.model, self.data)

@@ -64,7 +64,7 @@ class Rover(gym.Env):
         return self.data.qvel[5]
 
     def step(self, action):
-        ahead, turn = 8 * np.clip(np.asarray(action, float), -1, 1)
+        ahead, turn = 8 * np.clip(np.nan_to_num(np.asarray(action, float)), -1, 1)
         self.data.ctrl[:] = np.repeat([ahead - turn, ahead + turn], 2)
         for _ in range(5):
             mujoco.mj_step(self.model, self.data)
@@ -122,7 +122,7 @@ class Boat(gym.Env):
         return {"speed": 1.0 - abs(speed), "turn": -0.5 * rate**2}
 
     def step(self, action):
-        thrust, rudder = np.clip(np.asarray(action, float), -1, 1)
+        thrust, rudder = np.clip(np.nan_to_num(np.asarray(action, float)), -1, 1)
         along, aside = self.velocity
         self.velocity = self.velocity + 0.1 * np.array(
             [2 * thrust - 1.2 * along + self.rate * aside, -2.5 * aside - self.rate * along]

@@ -8,17 +8,18 @@ from tests.checking.judging import case, check_case, findings, mark_slow
 
 pytest.importorskip("mujoco")
 FILE = "broken_legs.py"
+CONSTANT = ("RL110", "info")
 
 
-def broken(name, severity="warning", twin="Leg"):
-    return case(f"{FILE}:{name}", (name[:5], severity), twin=f"{FILE}:{twin}", slow=True)
+def broken(name, *more, severity="warning", twin="Leg"):
+    return case(f"{FILE}:{name}", (name[:5], severity), *more, twin=f"{FILE}:{twin}", slow=True)
 
 
 CASES = [
     broken("RL628LegLandsInEveryStep"),
-    broken("RL811LegOrder", "error"),
-    broken("RL840LegFeelsNothing"),
-    broken("RL840LegSearchesTheShin", twin="RL840LegSearches"),
+    broken("RL811LegOrder", severity="error"),
+    broken("RL840LegFeelsNothing", CONSTANT),
+    broken("RL840LegSearchesTheShin", CONSTANT, twin="RL840LegSearches"),
 ]
 
 
