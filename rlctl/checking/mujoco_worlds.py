@@ -36,6 +36,7 @@ from rlctl.environments.info import find_mujoco
 FREE, BALL, SLIDE = 0, 1, 2  # MuJoCo's types of joints; 3 is a hinge
 PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
 ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
+LINEAR = (FIXED_GAIN, AFFINE)
 FIELDS = ("data.", "model.")
 KEPT = (
     *("data.qpos", "data.qvel", "data.time", "data.act", "data.ctrl", "data.qfrc_applied", "data.xfrc_applied"),
@@ -282,14 +283,17 @@ class MujocoStateReader:
         return min(sizes, default=math.inf)
 
     def read_targets(self) -> dict[JointKey, MotorTarget]:
-        """See `StateReader`; of actuators whose input is a position."""
-        targets = {}
+        """See `StateReader`; of actuators that pull a joint back to a position, which may change while they act."""
+        targets, model = {}, self.model
         for motor in self.world.motors:
-            if motor.holds_position:
+            number = motor.number
+            is_linear = (int(model.actuator_gaintype[number]), int(model.actuator_biastype[number])) == LINEAR
+            gain, (offset, pull, *_) = model.actuator_gainprm[number, 0], model.actuator_biasprm[number]
+            if is_linear and gain > 0 > pull:
                 force = math.inf
-                if self.model.actuator_forcelimited[motor.number]:
-                    force = float(np.abs(self.model.actuator_forcerange[motor.number]).max()) * abs(motor.gear)
-                value = float(self.data.ctrl[motor.number]) / motor.gear
+                if model.actuator_forcelimited[number]:
+                    force = float(np.abs(model.actuator_forcerange[number]).max()) * abs(motor.gear)
+                value = float(gain * self.data.ctrl[number] + offset) / float(-pull * motor.gear)
                 targets[motor.body, motor.joint.index] = MotorTarget(value, force, f"actuator {motor.name}")
         return targets
 

@@ -127,9 +127,23 @@ class RL012OtherSpaces(Reach):
 class RL014ActsInTime(Reach):
     """Its event acts twice in an episode; nothing is wrong with it."""
 
+    events = {"gust": Event("interval", events.push, every_s=1.0, body="arm", link="lbr_iiwa_link_6", force=(0.0, 1.0))}
+
+
+@dataclass
+class RL014PushesTheStand(Reach):
+    """Without a link it is the base that is pushed, which is fixed."""
+
     events = {"gust": Event("interval", events.push, every_s=1.0, body="arm", force=(0.0, 1.0))}
 
 
 @dataclass
+class RL014WeighsTheStand(Reach):
+    events = {"load": Event("reset", events.scale_mass, body="arm", links=["lbr_iiwa_link_0"], factor=(0.5, 2.0))}
+
+
+@dataclass
 class RL014ActsTooLate(Reach):
-    events = {"gust": Event("interval", events.push, every_s=30.0, body="arm", force=(0.0, 1.0))}
+    events = {
+        "gust": Event("interval", events.push, every_s=30.0, body="arm", link="lbr_iiwa_link_6", force=(0.0, 1.0))
+    }

@@ -24,6 +24,18 @@ CASES = [
         twin="broken_variants.py:RL014ActsInTime",
         slow=True,
     ),
+    case(
+        "broken_variants.py:RL014PushesTheStand",
+        ("RL014", "warning"),
+        twin="broken_variants.py:RL014ActsInTime",
+        slow=True,
+    ),
+    case(
+        "broken_variants.py:RL014WeighsTheStand",
+        ("RL014", "warning"),
+        twin="broken_variants.py:RL014AppliesTheMass",
+        slow=True,
+    ),
     case("broken_variants.py:RL013Misspelled", ("RL013", "warning"), twin=SOUND),
     case("broken_variants.py:RL012WrongKey", ("RL012", ERROR), twin=SOUND, slow=True),
     case("broken_variants.py:RL012WrongParameter", ("RL012", ERROR), twin=SOUND, slow=True),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from rlctl.checking.command_sweeps import CommandSweep, sweep_command
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.experiments.goals import (
     DrawnGoal,
@@ -41,6 +42,14 @@ class CommandTrials:
     paid: Sequence[DrawnPlace]  # Those that change a reward
     unpaid: Sequence[DrawnPlace]  # Those that change none
     sizes: Mapping[str, int]  # how many numbers each attribute has
+    names: Sequence[str]  # of the observed numbers
+    sweeps: dict[DrawnPlace, CommandSweep | None] = dataclasses.field(default_factory=dict)
+
+    def sweep(self, place: DrawnPlace) -> CommandSweep | None:
+        """Return what steps pay for many values of a number of a command; None where that is not known."""
+        if place not in self.sweeps:
+            self.sweeps[place] = sweep_command(self.instance, place)
+        return self.sweeps[place]
 
     def name(self, place: DrawnPlace) -> str:
         """Name a number of a command: `self.command[1]`."""
@@ -85,7 +94,7 @@ def change_commands(context: Context) -> Iterator[ChildMessage]:
     found = find_drawn(instance, _list_numbers)
     paid: list[DrawnPlace] = []
     unpaid: list[DrawnPlace] = []
-    trials = CommandTrials(instance, paid, unpaid, found.sizes)
+    trials = CommandTrials(instance, paid, unpaid, found.sizes, names)
     for name, places in found.stays.items():
         for place in places:
             shown = [names[element] for element, _ in find_copies(instance, place)]

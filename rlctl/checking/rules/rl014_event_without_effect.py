@@ -5,11 +5,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rlctl.checking.experiments.variants import TaskVariants, judges_variants, play_variant
-from rlctl.checking.instance import Context, EnvironmentRaised
-from rlctl.checking.records import ChildMessage, Skipped
+from rlctl.checking.bullet_worlds import read_states, read_world
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments.variants import STEPS, TaskVariants, judges_variants
+from rlctl.checking.instance import EnvironmentRaised, Instance
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.values import flatten
+from rlctl.environments.info import find_mujoco
 from rlctl.task.body import Body
 from rlctl.task.events import Event
 from rlctl.task.events.event import Widening
@@ -20,15 +25,20 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         An event of a task draws numbers and reports them, but changes nothing with them: what it calls in the world
-        is the same for other numbers, and so is an episode with its ranges at both ends. Or its interval is longer than
-        an episode, so that it never acts. The policy is trained without this randomisation.
+        is the same for other numbers, and so is an episode with its ranges at both ends. Or it pushes a part, or
+        changes its mass, that is fixed to the world: episodes with its ranges at both ends are the same to the last bit
+        although the robot moves. Or its interval is longer than an episode, so that it never acts. The policy is
+        trained without this randomisation.
     """,
     fix="""
-        Apply what the event's function draws, such as sim.body('arm').scale_mass(drawn); let every_s be a part of
-        episode_s.
+        Apply what the event's function draws, such as sim.body('arm').scale_mass(drawn); name a link that moves, since
+        without one a push acts on the base; let every_s be a part of episode_s.
     """,
 )
 
+FELT = ("push", "scale_mass")
+"""Calls that change how a body moves which is not fixed: a force at once, and a mass of a robot whose joints move."""
+EARLY = 0.2  # part of a played variant after which an event acts that has an interval
 MOMENTS = ("reset", "start", "interval")  # of events that change the world
 PLAIN = (str, float, bool, np.ndarray, np.floating)
 """What is read of a body to compute with; more than that, such as an id, may be used to change the engine itself."""
@@ -39,6 +49,7 @@ class SpiedCalls:
     """What an event's function did with the world."""
 
     calls: list[str] = dataclasses.field(default_factory=list)
+    names: set[str] = dataclasses.field(default_factory=set)  # of the same calls
     is_complete: bool = True  # False if it got at something whose use cannot be seen
 
 
@@ -56,6 +67,7 @@ class Spy:
 
         def call(*arguments: Any, **keywords: Any) -> Any:
             self._noted.calls.append(_describe((name, arguments, keywords)))
+            self._noted.names.add(name)
             result = value(*arguments, **keywords)
             return Spy(result, self._noted) if isinstance(result, Body) else result
 
@@ -97,11 +109,16 @@ def _find_idle_events(variants: TaskVariants) -> Iterator[ChildMessage]:
         with variants.context.fresh() as instance:
             instance.reset(0)
             sim = instance.env.unwrapped.sim
-            idle = [name for name, event in events.items() if _is_idle(name, event, sim)]
-        for name in idle:
+            spied = {name: _spy(name, event, sim) for name, event in events.items()}
+        for name, seen in spied.items():
             ranges = _find_ranges(name, events[name])
-            if ranges and _are_ends_equal(variants.context, name, ranges):
+            if not ranges or not (seen.is_idle or seen.is_felt):
+                continue
+            if _are_ends_equal(variants, name, ranges, needs_motion=not seen.is_idle):
                 message = f"event {name!r} draws {', '.join(ranges)} and changes nothing with it"
+                if not seen.is_idle:
+                    message = f"event {name!r} changes nothing: with {', '.join(ranges)} at both ends of the range, the"
+                    message += " same actions give the same episode to the last bit, although the robot moves"
                 yield RuleFinding(RULE, message, {"element": f"events.{name}"})
     except EnvironmentRaised:  # RL011 plays all events
         yield Skipped(RULE.id, "an event raises (RL011)")
@@ -119,20 +136,26 @@ def _find_late_events(variants: TaskVariants) -> Iterator[RuleFinding]:
             yield RuleFinding(RULE, message, evidence)
 
 
-def _is_idle(name: str, event: Event, sim: Any) -> bool:
-    """Say whether an event does the same with the world whatever it draws."""
+@dataclasses.dataclass(frozen=True)
+class _SpiedEvent:
+    is_idle: bool = False  # Whether it does the same with the world whatever it draws
+    is_felt: bool = False  # Whether what it draws changes how a body moves that is not fixed
+
+
+def _spy(name: str, event: Event, sim: Any) -> _SpiedEvent:
     seen = []
     for seed in (0, 1):
         noted = SpiedCalls()
         try:
             drawn = event.bind(name)(Spy(sim, noted), np.random.default_rng(seed), 1.0)
         except Exception:  # RL011 plays it; or it needs more than a spy has
-            return False
+            return _SpiedEvent()
         if not noted.is_complete:
-            return False
-        seen.append((drawn, noted.calls))
-    (first, first_calls), (second, second_calls) = seen
-    return bool(first != second and first_calls == second_calls)
+            return _SpiedEvent()
+        seen.append((drawn, noted))
+    (first, one), (second, two) = seen
+    differs = one.calls != two.calls
+    return _SpiedEvent(bool(first != second and not differs), differs and not one.names.isdisjoint(FELT))
 
 
 def _find_ranges(name: str, event: Event) -> dict[str, tuple[float, float]]:
@@ -142,13 +165,37 @@ def _find_ranges(name: str, event: Event) -> dict[str, tuple[float, float]]:
     return {key: (low, high) for key, (low, high) in ends.items() if low < high}
 
 
-def _are_ends_equal(context: Context, name: str, ranges: Mapping[str, tuple[float, float]]) -> bool:
+def _are_ends_equal(
+    variants: TaskVariants, name: str, ranges: Mapping[str, tuple[float, float]], *, needs_motion: bool
+) -> bool:
     """Say whether an episode is the same to the last bit with the ranges of an event at both ends."""
-    episodes = []
+    episodes, event = [], variants.task.events[name]
+    early_s = EARLY * STEPS * variants.task.control_dt
+    more = {"every_s": min(event.every_s, early_s)} if event.when == "interval" else {}
     for end in (0, 1):
         changed = {key: [ends[end]] * 2 for key, ends in ranges.items()}
-        spec = dataclasses.replace(context.spec, events={**context.spec.events, name: changed})
-        with context.fresh(spec=spec) as instance:
-            episodes.append(play_variant(instance))
-    at_low, at_high = episodes
-    return bool(np.array_equal(at_low, at_high))
+        spec = variants.context.spec
+        spec = dataclasses.replace(spec, events={**spec.events, name: {**changed, **more}})
+        with variants.context.fresh(spec=spec) as instance:
+            episodes.append(_play(instance))
+    (at_low, moves), (at_high, _) = episodes
+    return np.array_equal(at_low, at_high) and (moves or not needs_motion)
+
+
+def _play(instance: Instance) -> tuple[NDArray[np.float64], bool]:
+    """Return the observations and the states of joints of an episode, one after the other, and whether the joints
+    moved in the later part of it, when events at an interval have acted."""
+    rows, joints = [np.zeros(0)], []
+    for moment in EpisodePlayer(instance, FIRST_SEED, max_steps=STEPS):
+        joints.append(_read_joints(instance))
+        rows += [flatten(moment.observation), joints[-1]]
+    later = joints[len(joints) // 2 :]
+    moves = len(joints) > STEPS and all(not np.array_equal(one, later[0]) for one in later[1:])
+    return np.concatenate(rows), moves
+
+
+def _read_joints(instance: Instance) -> NDArray[np.float64]:
+    if (simulation := find_mujoco(instance.env)) is not None:
+        return np.concatenate([simulation[1].qpos, simulation[1].qvel])
+    clients = instance.find_clients()
+    return np.concatenate([np.zeros(0), *(state for one in clients for state in read_states(read_world(one)))])

@@ -42,6 +42,7 @@ MOVES = (0.01, 0.3, -0.3, 1.0, -1.0, 2.0, -2.0)
 """By so much a joint is moved [rad], [m], or its speed changed [rad/s], [m/s]: by more, where a command
 that is clipped does not answer."""
 FEWEST_JOINTS = 3
+PAIR_ERROR = 0.1  # of the mean positions of two joints that are compared, at most [rad], [m]
 NEAR = 0.05  # of sorted targets and positions [rad], [m]
 
 
@@ -148,7 +149,8 @@ def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
             (np.abs(values[order] - np.sort(at)).max() - allowed for at, allowed in ((means, error), (positions, 0.0))),
         )
         wrong = np.flatnonzero(np.abs(values - means) > max(APART, 3 * error))
-        if len(targets) >= FEWEST_JOINTS and is_sorted_same <= NEAR and wrong.size >= 2:
+        is_known = len(targets) >= FEWEST_JOINTS or error <= PAIR_ERROR
+        if is_known and is_sorted_same <= NEAR and wrong.size >= 2:
             index = int(wrong[0])
             what = f"with the zero action the {len(targets)} motor targets of {name} are its joint positions at reset"
             at, value = float(positions[index]), float(values[index])

@@ -1,0 +1,60 @@
+"""RL640: more than the command pays more."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.command_sweeps import CommandSweep
+from rlctl.checking.experiments.commands import CommandTrials, judges_commands
+from rlctl.checking.records import FIRST_SEED, ChildMessage
+from rlctl.checking.rule import Rule, RuleFinding, Severity
+
+RULE = Rule(
+    "RL640",
+    "more than the command pays more",
+    Severity.WARNING,
+    meaning="""
+        No value of the command is the best one for a motion: the check played the same step with many values of the
+        command, and the reward rises without end as the command falls, or rises, or as it moves away from one value to
+        both sides. So the policy is paid for moving as far beyond the command, or away from it, as it can. Most often
+        the difference has no absolute value and no square, or the sign of the error's term is wrong.
+    """,
+    fix="""
+        Pay less for an error of either sign: np.exp(-(command - velocity)**2 / width), or -abs(command - velocity).
+        If more than the command is welcome, cap it: min(velocity, command).
+    """,
+)
+
+SAME_SLOPE = 1e-3  # relative difference of the slopes of lines
+MOVES = 1e-6  # part of the range of the command by which the worst value has to vary
+
+
+@judges_commands(RULE)
+def _find_endless(trials: CommandTrials) -> Iterator[ChildMessage]:
+    for place in trials.paid:
+        sweep = trials.sweep(place)
+        how = "" if sweep is None else _describe(sweep)
+        if sweep is not None and how:
+            name, low, high = trials.name(place), float(sweep.drawn.min()), float(sweep.drawn.max())
+            message = (
+                f"{how}, with {name} from {sweep.moments[0].values[0]:.3g} to {sweep.moments[0].values[-1]:.3g} in"
+            )
+            message += f" {len(sweep.moments)} of {len(sweep.moments)} steps (resets draw {low:.3g} to {high:.3g})"
+            yield RuleFinding(RULE, message, {"element": name, "seed": FIRST_SEED})
+
+
+def _describe(sweep: CommandSweep) -> str:
+    """Say how the reward rises without end; empty where it does not."""
+    moments = sweep.moments
+    worst = np.array([moment.worst for moment in moments])
+    if np.isfinite(worst).all() and np.ptp(worst) > MOVES * np.ptp(sweep.drawn):
+        return "the reward is lowest where the motion is as commanded, and rises as the command moves away from it"
+    slopes = np.array([moment.slope for moment in moments])
+    lines = slopes[np.isfinite(slopes)]
+    if lines.size and np.ptp(lines) > SAME_SLOPE * np.abs(lines).max():
+        return ""  # a product of the command and a velocity
+    if all(moment.grows_downwards for moment in moments):
+        return "the reward rises without end as the command falls: more than the command pays more"
+    if all(moment.grows_upwards for moment in moments):
+        return "the reward rises without end as the command rises: less than the command pays more"
+    return ""
