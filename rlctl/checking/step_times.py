@@ -21,6 +21,7 @@ NEAR = 0.25  # relative error of a time that is estimated from positions and vel
 EXACT = 1e-3
 MOVING, VARIES = 0.1, 0.2  # parts of the largest speed that count, and of the mean by which speeds have to differ
 CLOSE, USUAL = 0.05, 0.9  # relative error of a time, and part of the steps in which it is so small
+CLOSE_SIZE, USUAL_SIZE = 0.1, 0.75  # the same of a speed forwards: it changes within a step, and robots slip
 FEWEST_STEPS = 20
 MOST_COMPARED = 40  # attributes of which lengths are compared
 UNIT = 1e-6  # how far from 1 the length of a quaternion may be
@@ -206,7 +207,8 @@ def _find_lengths(log: AttributeLog, pairs: Sequence[tuple[int, int, int]]) -> I
     for column, other, size in pairs:
         if other + size <= column or other >= column + 2:
             way = np.linalg.norm(changes[:, column : column + 2], axis=1)
-            seconds = _find_factor(way, np.linalg.norm(middle[:, other : other + size], axis=1))
+            limits = (CLOSE, USUAL) if size > 1 else (CLOSE_SIZE, USUAL_SIZE)
+            seconds = _find_factor(way, np.linalg.norm(middle[:, other : other + size], axis=1), *limits)
             if seconds is not None:
                 yield column, other, size, seconds
 
@@ -232,12 +234,12 @@ def _find_turns(log: AttributeLog) -> Iterator[NamedRate]:
                 yield NamedRate(f"the turn of ({log.names[column]} to {log.names[column + 3]})", rate, seconds)
 
 
-def _find_factor(ways: Numbers, speeds: Numbers) -> float | None:
+def _find_factor(ways: Numbers, speeds: Numbers, near: float = CLOSE, usual: float = USUAL) -> float | None:
     """Return by which time speeds have to be multiplied to be ways, if it is nearly always the same [s]."""
     is_fast = speeds > MOVING * speeds.max(initial=0.0)
     if speeds.std() < VARIES * speeds.mean() or is_fast.sum() < FEWEST_STEPS:
         return None
     times = ways[is_fast] / speeds[is_fast]
     seconds = float(np.median(times))
-    is_same = seconds > LEAST_MOTION and np.mean(np.abs(times / seconds - 1) < CLOSE) > USUAL
+    is_same = seconds > LEAST_MOTION and np.mean(np.abs(times / seconds - 1) < near) > usual
     return seconds if is_same else None
