@@ -63,6 +63,8 @@ def _read_engine(log: AttributeLog) -> StepTimes | None:
 def _read_declared(log: AttributeLog) -> StepTimes | None:
     """Return the two times of which what is declared says one, and how positions follow velocities shows which."""
     declared = find_declared(log)
+    if declared is not None and declared.control_s is not None:
+        return StepTimes(declared.control_s, declared.control_s / declared.substeps, f"the source and {declared.count}")
     shown = estimate_step(log) if declared is not None else None
     if declared is None or shown is None:
         return None

@@ -84,8 +84,9 @@ def _change(shown: ActionTrials, trials: Trials, seed: int, at: int) -> list[Fra
     """Play an episode in which all numbers of one action are at that end of their range which is farther away."""
     chosen = trials.actions(seed, STEPS)
     numbers = flatten_action(trials.instance.action_leaves, chosen[at])
-    values = {
-        one: max(one.ends, key=lambda end, number=numbers[one.column]: abs(end - number)) for one in shown.dimensions
-    }
+    values = {}
+    for one in shown.dimensions:
+        low, high = one.ends
+        values[one] = low if abs(low - numbers[one.column]) > abs(high - numbers[one.column]) else high
     chosen[at] = trials.change(chosen[at], values)
     return trials.play(seed, chosen)

@@ -56,6 +56,13 @@ READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., comput
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
 EXACT = 2e-6  # relative; the last bits of float32 and of sums
 OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
+COMBINED, FAR_OFF = 1e-4, 0.02  # largest errors of a sum that is an element, and of one that is not, parts of its size
+SUMMED = {
+    "places seen from something": ("position of",),
+    "velocities seen from something": ("velocity of", "angular velocity of", "speed of"),
+}
+SMALLEST = 1e-6  # singular value, part of the largest one
+LOOKS_PER_NUMBER = 4  # that a sum needs
 LATE_LINK = 0.001  # [m]
 
 
@@ -186,8 +193,42 @@ def _find_elements_of_last_look(world: LoggedWorld, fix: str) -> Iterator[RuleFi
     only_earlier = earlier & ~present.any(axis=0) & ~present.any(axis=1, keepdims=True)  # shape (columns, features)
     names, found = name_features(logs[0]), zip(columns, only_earlier, strict=True)
     old = {column: names[int(row.argmax())] for column, row in found if row.any()}
+    for what, kinds in SUMMED.items():
+        of_kind = [place for place, name in enumerate(names) if name.startswith(kinds)]
+        for column in _find_sums(observed[:, columns], now, before, of_kind):
+            old.setdefault(columns[column], what)
     if old:
         yield _describe_old(old, "before the whole step, not of the one after it", fix)
+
+
+def _find_sums(observed: Array, now: Array, before: Array, features: Sequence[int]) -> list[int]:
+    """Return the elements that are a sum of multiples of features at the observation before, such as a difference of
+    two places in some axes, and no such sum of the present state; without those of which the present sum is observed
+    too: they are a history. Shapes (looks, elements), and (looks, numbers) of both states."""
+    size = observed.std(axis=0)
+    fitted = [_fit(part, observed) for part in (before[:, features], now[:, features], now)]
+    if any(one is None for one in fitted[:2]):
+        return []
+    weights, earlier = fitted[0] or (observed, size)
+    present = np.min([one[1] for one in fitted[1:] if one is not None], axis=0)
+    found = []
+    for place in np.flatnonzero((earlier < COMBINED * size) & (present > FAR_OFF * size)).tolist():
+        shown = np.abs(observed - (now[:, features] @ weights[:, place])[:, None]).max(axis=0)
+        if shown.min() > FAR_OFF * size[place]:
+            found.append(place)
+    return found
+
+
+def _fit(features: Array, observed: Array) -> tuple[Array, Array] | None:
+    """Return the weights by which features add up to what is observed, from every other look, and the largest error in
+    the rest of the looks; None for too few looks. Shapes (features, elements) and (elements,)."""
+    half, rest = np.s_[::2], np.s_[1::2]
+    moves = features.std(axis=0) > OLD
+    weights = np.zeros((features.shape[1], observed.shape[1]))
+    weights[moves], _, rank, _ = np.linalg.lstsq(features[half][:, moves], observed[half], rcond=SMALLEST)
+    if len(features) < LOOKS_PER_NUMBER * max(1, int(rank)):
+        return None
+    return weights, np.asarray(np.abs(observed[rest] - features[rest] @ weights).max(axis=0))
 
 
 def _describe_old(old: Mapping[int, str], when: str, fix: str) -> RuleFinding:
