@@ -113,6 +113,19 @@ class Glint(Swimmer):
         return {name: (part + noise(0, 0.005, part.size)).astype(np.float32) for name, part in parts.items()}
 
 
+class RL815TugOldWay(Tug):
+    """The way to the goal is of the step before, the velocity is not."""
+
+    def step(self, action):
+        self.old = super().way()
+        returned = super().step(action)
+        self.old = None
+        return returned
+
+    def way(self):
+        return super().way() if getattr(self, "old", None) is None else self.old
+
+
 class TugThatTilts(Tug):
     """It heels in curves; with noise."""
 

@@ -1,4 +1,4 @@
-"""RL129, RL650; RL815, RL820 and RL832 of robots whose mistake shows in sums, in lengths, or in the source only."""
+"""RL129, RL650; further forms of RL115, RL119, RL815, RL820 and RL832: in sums, in lengths, or by the source only."""
 
 import pytest
 
@@ -22,6 +22,7 @@ CASES = [
     broken("RL650GlintPaidLate", "Glint", slow=True),
     broken("RL832TugFast", "Tug", slow=True),
     broken("RL832GlintFast", "Glint", slow=True),
+    broken("RL815TugOldWay", "Tug", slow=True),
     broken("RL815BallGantryOldWays", "BallGantry", pybullet=True, slow=True),
     broken("RL820BallGantryFast", "BallGantry", pybullet=True, slow=True),
 ]

@@ -192,7 +192,7 @@ def _play(
     for attribute in turned:  # a reset may not set them
         attribute.assign(attribute.value)
     size = observed[0].size if observed else 0
-    rows = np.array([row for row in observed if row.size == size]).reshape(-1, size)
+    rows = np.stack([row for row in observed if row.size == size]) if size else np.zeros((len(observed), 0))
     return TurnedEpisode(np.array(headings), np.nan_to_num(rows), np.array(rewards))
 
 

@@ -15,13 +15,17 @@ from rlctl.checking.derived_fields import (
     find_fields,
     find_stale_fields,
 )
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
+from rlctl.checking.old_ways import find_old_ways
 from rlctl.checking.readings import FEWEST_LOOKS, MOST_ELEMENTS, NEARLY_ALL, name_features, read_features
-from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
+from rlctl.checking.shared_frames import name_elements, name_part
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls
@@ -37,7 +41,8 @@ RULE = Rule(
         computeForwardKinematics returns the position before that step (an info); or the state is read before
         the last stepSimulation. MuJoCo - mj_step leaves xpos, site_xpos, sensordata and all else that follows
         from positions as they were at the beginning of its last substep; and where reset writes qpos without
-        mj_forward, they are of the episode before, or 0 after mj_resetData.
+        mj_forward, they are of the episode before, or 0 after mj_resetData. A robot without an engine - the length
+        of a vector follows where an attribute was before the step, and not where it is.
     """,
     fix="""
         Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
@@ -53,6 +58,7 @@ FORWARD = (
 )
 READ_MUJOCO = "Read after the last mj_step; then call mujoco.mj_forward(model, data) for what follows from positions."
 READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., computeForwardKinematics=True)."
+READ_ATTRIBUTES = "Compute what is observed after the robot has moved."
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
 EXACT = 2e-6  # relative; the last bits of float32 and of sums
 OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
@@ -75,6 +81,24 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         yield from old
         if not old:
             yield from _find_elements_of_last_look(world, fix)
+
+
+@judges_records(RULE, "worlds", "attributes", "action effects")
+def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
+    """Yield the vectors that a robot without an engine observes from where it was a step before."""
+    log: AttributeLog | None = records.facts.get("attributes")
+    if log is None or np.isfinite(log.physics_s):
+        return  # the engine tells more
+    if any(finding.rule == "RL115" for finding in records.findings):
+        return  # all that is observed is late
+    names, parts = name_elements(records.require_built())
+    for elements, place in find_old_ways(log, parts):
+        message = (
+            f"{name_part(names[elements])} is a way from where {place} was before the step, and not from where it is"
+        )
+        evidence = {"element": names[elements.start], "value": place}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_ATTRIBUTES)
+        return
 
 
 @judges_trials(RULE, place=10)
