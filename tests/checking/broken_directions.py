@@ -155,6 +155,32 @@ class RL119TugTiltsInDegrees(TugThatTilts):
         return np.degrees(self.heel)
 
 
+class TugAhead(Tug):
+    """It is paid for its speed forwards, and does not observe where its goal is."""
+
+    rlctl_ignore = {**Tug.rlctl_ignore, "RL114": "the goal ends an episode and is not observed"}
+
+    def space(self):
+        return box(4)
+
+    def observe(self):
+        return np.array([*self.speed(), self.turning, self.forwards], np.float32)
+
+    def pay(self):
+        return self.speed()[0]
+
+    def step(self, action):
+        observed, _, _, truncated, _ = super().step(action)
+        return observed, float(self.pay() - 0.01 * np.square(action).sum()), False, truncated, {}
+
+
+class RL129TugEast(TugAhead):
+    """It is paid for its speed along the axis of the world."""
+
+    def pay(self):
+        return self.velocity[0]
+
+
 class RL115TugOldView(Tug):
     """It observes the oldest of four looks."""
 

@@ -15,6 +15,7 @@ CASES = [
     broken("RL129TugInTheWorld", "Tug"),
     broken("RL129GlintInTheWorld", "Glint", slow=True),
     broken("RL129TugTurnedTwice", "Tug", slow=True),
+    broken("RL129TugEast", "TugAhead", slow=True),
     broken("RL129PlatformInTheWorld", "Platform", slow=True),
     broken("RL115TugOldView", "Tug", slow=True),
     broken("RL119TugTiltsInDegrees", "TugThatTilts", slow=True),

@@ -6,10 +6,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments.rotated import RotatedRobot, Turning, judges_rotated
+from rlctl.checking.experiments.rotated import RotatedRobot, judges_rotated
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.transitions import name_floats
+from rlctl.checking.turnings import Turning
 
 RULE = Rule(
     "RL129",
@@ -36,7 +37,7 @@ VARIED = 0.5  # how far headings at the start are apart [rad]
 SAME = 0.02  # part of the size of a cosine by which its size may change
 TURN_ERROR = 0.1  # part of the length of a vector
 SAME_DIRECTION = 0.9  # length of the mean of unit vectors
-MATTERS = 0.05  # part of what rewards change in an episode
+MATTERS = 0.25  # part of what rewards differ by in episodes that are not turned
 TINY = 1e-4  # of rewards
 
 
@@ -66,7 +67,9 @@ def _find_world_vectors(robot: RotatedRobot) -> Iterator[RuleFinding]:
     if turns.any():
         return
     rewards = [np.array([episode.rewards for episode in turning.episodes]) for turning in turnings]
-    if all(_matters(each) for each in rewards):
+    spread = float(np.ptp(np.concatenate([each[0] for each in rewards])))
+    least = max(TINY, MATTERS * spread)
+    if all((np.ptp(each, axis=0) > least).all() for each in rewards):
         low, high = rewards[0][:, -1].min(), rewards[0][:, -1].max()
         message = (
             f"with its world turned about the vertical, the robot observes the same and gets rewards from {low:.4g}"
@@ -88,12 +91,6 @@ def _are_varied(turnings: Sequence[Turning]) -> bool:
     """Say whether resets draw headings that are far apart."""
     headings = [turning.episodes[0].headings[0] for turning in turnings]
     return any(np.cos(one - other) < np.cos(VARIED) for one in headings for other in headings)
-
-
-def _matters(rewards: NDArray[np.float64]) -> bool:
-    """Say whether rewards differ with the angle in all steps. Shape (angles, steps)."""
-    least = max(TINY, MATTERS * float(np.ptp(rewards[0])))
-    return bool((np.ptp(rewards, axis=0) > least).all())
 
 
 def _shows_heading(turnings: Sequence[Turning]) -> bool:
