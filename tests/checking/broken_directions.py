@@ -158,7 +158,7 @@ class RL119TugTiltsInDegrees(TugThatTilts):
 class TugAhead(Tug):
     """It is paid for its speed forwards, and does not observe where its goal is."""
 
-    rlctl_ignore = {**Tug.rlctl_ignore, "RL114": "the goal ends an episode and is not observed"}
+    rlctl_ignore = {**Tug.rlctl_ignore, "RL114": "its goal is not observed", "RL609": "it has no end"}
 
     def space(self):
         return box(4)
@@ -262,6 +262,7 @@ PLATFORM = """
 class Platform(gym.Env):
     """A base on two slides and a hinge keeps a commanded speed; only the whole reward is known."""
 
+    rlctl_ignore = {"RL609": "it has no end"}
     frames = 8
 
     def __init__(self):
@@ -307,7 +308,8 @@ class RL129PlatformInTheWorld(Platform):
         return self.data.qvel[:2].copy()
 
 
-GANTRY = """<robot name="gantry"><link name="rail"/>
+GANTRY = """<robot name="gantry"><link name="rail"><inertial><mass value="1"/>
+<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <link name="bridge"><inertial><mass value="1"/>
 <inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <link name="pad"><inertial><mass value=".6"/>

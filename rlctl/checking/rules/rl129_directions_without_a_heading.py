@@ -69,7 +69,7 @@ def _find_world_vectors(robot: RotatedRobot) -> Iterator[RuleFinding]:
     rewards = [np.array([episode.rewards for episode in turning.episodes]) for turning in turnings]
     spread = float(np.ptp(np.concatenate([each[0] for each in rewards])))
     least = max(TINY, MATTERS * spread)
-    if all((np.ptp(each, axis=0) > least).all() for each in rewards):
+    if np.mean([np.ptp(each, axis=0).max() > least for each in rewards]) > MOSTLY:
         low, high = rewards[0][:, -1].min(), rewards[0][:, -1].max()
         message = (
             f"with its world turned about the vertical, the robot observes the same and gets rewards from {low:.4g}"
