@@ -43,6 +43,25 @@ def find_repeats(env: Any, declared: Mapping[str, float]) -> dict[str, int]:
     return found
 
 
+def find_control_times(env: Any, declared: Mapping[str, float], repeats: Collection[int]) -> set[float]:
+    """Return which declared times the source divides by how often a loop repeats, and the products of times and of such
+    a number: how long a whole step takes, as its author means it [s]."""
+    numbers = {name.rpartition(".")[2]: value for name, value in declared.items()}
+    found: set[float] = set()
+    for tree in parse_sources(env).values():
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Div | ast.Mult):
+                continue
+            one, two = (_evaluate(part, numbers) if _name(part) else None for part in (node.left, node.right))
+            if one is None or two is None:
+                continue
+            if isinstance(node.op, ast.Mult):
+                found |= {one * two for count, time in ((one, two), (two, one)) if count in repeats and 0 < time < 1}
+            elif two in repeats and 0 < one < 1:
+                found.add(one)
+    return found
+
+
 def _find_called(trees: Iterable[ast.Module], own: Collection[str]) -> list[ast.FunctionDef]:
     """Return the functions, and methods of classes of some names, that a step calls as far as their names tell."""
     functions: dict[str, list[ast.FunctionDef]] = {}

@@ -21,7 +21,9 @@ NEAR = 0.25  # relative error of a time that is estimated from positions and vel
 EXACT = 1e-3
 MOVING, VARIES = 0.1, 0.2  # parts of the largest speed that count, and of the mean by which speeds have to differ
 CLOSE, USUAL = 0.05, 0.9  # relative error of a time, and part of the steps in which it is so small
+CLOSE_SIZE, USUAL_SIZE = 0.1, 0.75  # the same of a speed forwards: it changes within a step, and robots slip
 FEWEST_STEPS = 20
+MOST_COMPARED = 40  # attributes of which lengths are compared
 UNIT = 1e-6  # how far from 1 the length of a quaternion may be
 
 
@@ -61,6 +63,8 @@ def _read_engine(log: AttributeLog) -> StepTimes | None:
 def _read_declared(log: AttributeLog) -> StepTimes | None:
     """Return the two times of which what is declared says one, and how positions follow velocities shows which."""
     declared = find_declared(log)
+    if declared is not None and declared.control_s is not None:
+        return StepTimes(declared.control_s, declared.control_s / declared.substeps, f"the source and {declared.count}")
     shown = estimate_step(log) if declared is not None else None
     if declared is None or shown is None:
         return None
@@ -79,6 +83,7 @@ class DeclaredTimes:
     count: str  # The name of the number of substeps
     substeps: int
     times: dict[str, float]  # of a step or of a substep, by name [s]
+    control_s: float | None  # of a step, where the source says which of both a time is [s]
 
 
 def find_declared(log: AttributeLog) -> DeclaredTimes | None:
@@ -96,7 +101,17 @@ def find_declared(log: AttributeLog) -> DeclaredTimes | None:
     if len(set(counts.values())) != 1 or not times:
         return None
     count, substeps = next(iter(counts.items()))
-    return DeclaredTimes(count, substeps, times)
+    known = {value for value in times.values() for other in times.values() if _is_part(other, value, substeps)}
+    known |= {value for value in log.control_times if any(_are_times(value, t, substeps) for t in times.values())}
+    return DeclaredTimes(count, substeps, times, known.pop() if len(known) == 1 else None)
+
+
+def _is_part(part: float, whole: float, count: int) -> bool:
+    return math.isclose(part * count, whole, rel_tol=EXACT)
+
+
+def _are_times(whole: float, time: float, count: int) -> bool:
+    return math.isclose(whole, time, rel_tol=EXACT) or _is_part(time, whole, count)
 
 
 def _list_times(log: AttributeLog, words: set[str]) -> dict[str, float]:
@@ -162,30 +177,42 @@ def list_named_rates(log: AttributeLog) -> list[NamedRate]:
     single = [NamedRate(log.names[column], log.names[rate], s) for column, rate, s in find_rates(log, log.values)]
     rates = {one.name for one in single} | {one.rate for one in single}
     free = [column for column in range(len(log.names)) if log.names[column] not in rates]
+    pairs = [(column, other, 2) for column in free for other in free if column + 1 in free and other + 1 in free]
+    places = [c for c in range(min(MOST_COMPARED, len(log.names)) - 1) if _are_neighbours(log, c)]
+    pairs += [(column, other, 1) for column in places for other in range(min(MOST_COMPARED, len(log.names)))]
     lengths = [
-        NamedRate(_name_pair(log, column), f"the length of {_name_pair(log, rate)}", seconds)
-        for column, rate, seconds in _find_lengths(log, [c for c in free if c + 1 in free])
+        NamedRate(_name_pair(log, column), _name_size(log, other, size), seconds)
+        for column, other, size, seconds in _find_lengths(log, pairs)
     ]
     return [*single, *lengths, *_find_turns(log)]
+
+
+def _are_neighbours(log: AttributeLog, column: int) -> bool:
+    return log.names[column].rpartition("[")[0] == log.names[column + 1].rpartition("[")[0]
 
 
 def _name_pair(log: AttributeLog, column: int) -> str:
     return f"({log.names[column]}, {log.names[column + 1]})"
 
 
-def _find_lengths(log: AttributeLog, columns: Sequence[int]) -> Iterator[tuple[int, int, float]]:
-    """Yield which pair of columns moves by the length of which other pair, and for how long [s]."""
+def _name_size(log: AttributeLog, column: int, size: int) -> str:
+    return f"the length of {_name_pair(log, column)}" if size > 1 else f"the size of {log.names[column]}"
+
+
+def _find_lengths(log: AttributeLog, pairs: Sequence[tuple[int, int, int]]) -> Iterator[tuple[int, int, int, float]]:
+    """Yield which two columns move by the length of which one or two others, and for how long [s]; of pairs of first
+    columns, with how many columns the second has."""
     steps = np.flatnonzero(log.is_step)
     changes, middle = log.changes(log.values), (log.values[steps] + log.values[steps - 1]) / 2
     if len(steps) < FEWEST_STEPS:
         return
-    for column in columns:
-        way = np.linalg.norm(changes[:, column : column + 2], axis=1)
-        for other in columns:
-            if abs(other - column) > 1:
-                seconds = _find_factor(way, np.linalg.norm(middle[:, other : other + 2], axis=1))
-                if seconds is not None:
-                    yield column, other, seconds
+    for column, other, size in pairs:
+        if other + size <= column or other >= column + 2:
+            way = np.linalg.norm(changes[:, column : column + 2], axis=1)
+            limits = (CLOSE, USUAL) if size > 1 else (CLOSE_SIZE, USUAL_SIZE)
+            seconds = _find_factor(way, np.linalg.norm(middle[:, other : other + size], axis=1), *limits)
+            if seconds is not None:
+                yield column, other, size, seconds
 
 
 def _find_turns(log: AttributeLog) -> Iterator[NamedRate]:
@@ -209,12 +236,12 @@ def _find_turns(log: AttributeLog) -> Iterator[NamedRate]:
                 yield NamedRate(f"the turn of ({log.names[column]} to {log.names[column + 3]})", rate, seconds)
 
 
-def _find_factor(ways: Numbers, speeds: Numbers) -> float | None:
+def _find_factor(ways: Numbers, speeds: Numbers, near: float = CLOSE, usual: float = USUAL) -> float | None:
     """Return by which time speeds have to be multiplied to be ways, if it is nearly always the same [s]."""
     is_fast = speeds > MOVING * speeds.max(initial=0.0)
     if speeds.std() < VARIES * speeds.mean() or is_fast.sum() < FEWEST_STEPS:
         return None
     times = ways[is_fast] / speeds[is_fast]
     seconds = float(np.median(times))
-    is_same = seconds > LEAST_MOTION and np.mean(np.abs(times / seconds - 1) < CLOSE) > USUAL
+    is_same = seconds > LEAST_MOTION and np.mean(np.abs(times / seconds - 1) < near) > usual
     return seconds if is_same else None

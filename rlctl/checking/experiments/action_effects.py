@@ -35,9 +35,9 @@ class ActionTrials:
 
     @property
     def is_late(self) -> bool:
-        """Whether the observation, but for what repeats the action, never follows the first action before the second
-        step."""
-        return self.earliest == {2}
+        """Whether the observation, but for what repeats the action, always follows the first action at the second step,
+        or at the same later one."""
+        return len(self.earliest) == 1 and min(self.earliest) > 1
 
 
 judges_actions = JudgeHook[ActionTrials]()

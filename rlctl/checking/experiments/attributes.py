@@ -17,7 +17,7 @@ from rlctl.checking.bullet_worlds import read_states, read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
-from rlctl.checking.loops import find_repeats
+from rlctl.checking.loops import find_control_times, find_repeats
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.term_names import is_about_steps, is_paid
@@ -69,6 +69,7 @@ class AttributeLog:
     declared: Mapping[str, float]  # numbers of the object, its class and its module that do not change, by name
     literals: tuple[float, ...]  # numbers in the source of its classes
     repeats: Mapping[str, int]  # how often loops of a step repeat, by what their `range` has
+    control_times: tuple[float, ...]  # of a whole step, as the source divides or multiplies times by these numbers [s]
 
     @property
     def is_step(self) -> NDArray[np.bool_]:
@@ -213,6 +214,7 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) 
     ]
     width = max(look.action.size for look in looks)
     declared = find_declared_numbers(instance.env)
+    repeats = find_repeats(instance.env, declared)
     info_names = {name: None for look in looks for name in look.infos}
     return AttributeLog(
         names=names[:MOST_NUMBERS],
@@ -227,7 +229,8 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) 
         episodes=np.array([look.episode for look in looks]),
         declared={name: value for name, value in declared.items() if name not in names},
         literals=tuple(sorted(_find_literals(instance.env))),
-        repeats=find_repeats(instance.env, declared),
+        repeats=repeats,
+        control_times=tuple(sorted(find_control_times(instance.env, declared, set(repeats.values())))),
     )
 
 

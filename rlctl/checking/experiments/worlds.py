@@ -1,5 +1,6 @@
 """The experiment `worlds`: watches the simulated worlds of an instance, for rules about physics and robots."""
 
+import collections
 import contextlib
 import dataclasses
 import functools
@@ -30,6 +31,7 @@ EPISODES = (("zero", 50), ("random", 60), ("random", 60), ("extreme", 50), ("ran
 """Actions and logged steps. The last ones are for what resets draw."""
 THROWN_EPISODES, THROWN_STEPS = (1, 2), 40  # in which free bodies are thrown that hardly moved
 STILL = 0.02  # standard deviation of a velocity [m/s]
+FEWEST_MOVING = 40  # looks in which a body moves: objects are hit now and then
 ENOUGH_EPISODES, PART_FOR_THE_REST = 5, 0.3  # of a slow environment; of the experiment's time
 
 
@@ -104,14 +106,16 @@ class WatchedWorlds:
 
 
 def _find_still(world: LoggedWorld) -> set[str]:
-    """Return the names of free bodies without joints that hardly moved."""
+    """Return the names of free bodies without joints that hardly moved, or in few looks."""
     fastest: dict[str, float] = {}
+    moving: collections.Counter[str] = collections.Counter()
     for log in world.logs:
         for body, states in log.bodies:
             if body.is_free and not body.joints:
-                speed = float(np.abs(states[:, VELOCITY]).std(axis=0).max())
-                fastest[body.name] = max(fastest.get(body.name, 0.0), speed)
-    return {name for name, speed in fastest.items() if speed < STILL}
+                velocities = np.abs(states[:, VELOCITY])
+                fastest[body.name] = max(fastest.get(body.name, 0.0), float(velocities.std(axis=0).max()))
+                moving[body.name] += int((velocities > STILL).any(axis=1).sum())
+    return {name for name, speed in fastest.items() if speed < STILL or moving[name] < FEWEST_MOVING}
 
 
 @dataclasses.dataclass(frozen=True)

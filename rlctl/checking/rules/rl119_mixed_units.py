@@ -6,14 +6,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking import rewards
-from rlctl.checking.engine_values import ScaledValue
+from rlctl.checking.engine_values import LEAST_MOTION, NOISY, NOISY_FACTOR, ScaledValue, center, explain
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.goals import SCALED_GOAL, ScaledGoal
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.rates import Rate, find_rates
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity, list_others
-from rlctl.checking.transitions import collect_transitions
+from rlctl.checking.step_times import find_rates as find_attribute_rates
+from rlctl.checking.transitions import collect_transitions, name_floats
 from rlctl.checking.worlds import Array
 
 RULE = Rule(
@@ -26,8 +28,9 @@ RULE = Rule(
         centimetres or degrees, and the rest in metres or radians. In an environment with an engine, a time of
         more than 5 s tells the same, and so does an element that is a value of the engine times such a number,
         with noise or without, beside another one that is in the engine's unit: an angle, a place, or the velocity
-        or angular velocity of a joint, a link or a body. Networks then see the other
-        elements as if they were 0, and sums of both in a reward mean nothing.
+        or angular velocity of a joint, a link or a body. So does an attribute times such a number, beside its own rate
+        in the larger unit. Networks then see the other elements as if they were 0, and sums of both in a reward mean
+        nothing.
     """,
     fix="Use metres, radians and seconds everywhere.",
 )
@@ -57,7 +60,9 @@ LONGEST_STEP = 5.0  # of an engine: no robot is controlled so rarely [s]
 LARGE = 100.0  # root mean square of what is in millimetres
 
 
-@judges_records(RULE, *rewards.WITH_SEARCH, "worlds", "goals")  # "worlds" compares with the state of the engine
+@judges_records(
+    RULE, *rewards.WITH_SEARCH, "worlds", "goals", "attributes"
+)  # "worlds" compares with the state of the engine
 def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
     built = records.require_built()
     if any(finding.rule == RULE.id for finding in records.findings):
@@ -65,6 +70,10 @@ def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
     scaled: ScaledGoal | None = records.facts.get(SCALED_GOAL)
     if scaled is not None and scaled.size >= LEAST_LARGE:
         yield _describe_scaled(scaled)
+        return
+    log: AttributeLog | None = records.facts.get("attributes")
+    if log is not None and (scaled_pair := _find_scaled_pair(log)) is not None:
+        yield _describe_pair(scaled_pair, name_floats(built.leaves))
         return
     steps = collect_transitions(records)
     steps = steps.select(np.arange(0, len(steps.rewards), max(1, len(steps.rewards) // MOST_ROWS)))
@@ -82,6 +91,48 @@ def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
     longest = pairs[-1]
     if (built.uses_pybullet or built.model) and longest.seconds > LONGEST_STEP and longest.size > LARGE:
         yield _finding(longest, f"a step of the simulation would take {longest.seconds:.3g} s: millimetres and metres")
+
+
+@dataclasses.dataclass(frozen=True)
+class _ScaledPair:
+    """Two elements that are attributes in different units, of which one changes by the other."""
+
+    small: int  # The element in the small unit
+    large: int
+    unit: UnitRatio
+    small_name: str  # of its attribute
+    large_name: str
+
+
+def _find_scaled_pair(log: AttributeLog) -> _ScaledPair | None:
+    """Return such a pair, with noise or without."""
+    sizes = np.unique(log.episodes, return_counts=True)[1].tolist()
+    observed, values = center(log.observed, sizes), center(log.values, sizes)
+
+    def find_element(attribute: int, factor: float) -> int | None:
+        """Return the element that is an attribute times a factor."""
+        is_known = values[:, attribute].std() > LEAST_MOTION
+        for column in np.flatnonzero(observed.std(axis=0) > 0).tolist() if is_known else ():
+            factors, left = explain(observed[:, [column]], values[:, [attribute]])
+            if left[0, 0] < NOISY and np.isclose(abs(factors[0, 0]), factor, rtol=NOISY_FACTOR):
+                return int(column)
+        return None
+
+    for place, rate, _ in find_attribute_rates(log, log.values):
+        for small, large in ((place, rate), (rate, place)):
+            for unit in UNITS:
+                one, two = find_element(small, unit.factor), find_element(large, 1.0)
+                is_large = one is not None and np.abs(log.observed[:, one]).max() > unit.least_size
+                if one is not None and two is not None and is_large:
+                    return _ScaledPair(one, two, unit, log.names[small], log.names[large])
+    return None
+
+
+def _describe_pair(pair: _ScaledPair, names: Sequence[str]) -> RuleFinding:
+    name = names[pair.small]
+    message = f"{name} is {pair.small_name} times {pair.unit.factor:.4g}, and {names[pair.large]} is {pair.large_name},"
+    message += f" of which one changes by the other: {pair.unit.small} and {pair.unit.large}"
+    return RuleFinding(RULE, message, {"element": name, "value": pair.unit.factor, "expected": 1.0})
 
 
 def _describe_scaled(goal: ScaledGoal) -> RuleFinding:

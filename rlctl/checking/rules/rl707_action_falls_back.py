@@ -51,7 +51,7 @@ def _find_falls(shown: ActionTrials) -> Iterator[RuleFinding]:
     floats = [dimension for dimension in shown.dimensions if "float" in dimension.leaf.dtype]
     if not floats:
         return
-    sweep = _Sweep(shown.trials, floats, 2 if shown.is_late else 1)
+    sweep = _Sweep(shown.trials, floats, min(shown.earliest) if shown.is_late else 1)
     jump = sweep.find_jump()
     if jump is None:
         return

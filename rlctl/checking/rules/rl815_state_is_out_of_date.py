@@ -15,13 +15,17 @@ from rlctl.checking.derived_fields import (
     find_fields,
     find_stale_fields,
 )
+from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
+from rlctl.checking.old_ways import find_old_ways
 from rlctl.checking.readings import FEWEST_LOOKS, MOST_ELEMENTS, NEARLY_ALL, name_features, read_features
-from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
+from rlctl.checking.shared_frames import name_elements, name_part
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls
@@ -37,7 +41,8 @@ RULE = Rule(
         computeForwardKinematics returns the position before that step (an info); or the state is read before
         the last stepSimulation. MuJoCo - mj_step leaves xpos, site_xpos, sensordata and all else that follows
         from positions as they were at the beginning of its last substep; and where reset writes qpos without
-        mj_forward, they are of the episode before, or 0 after mj_resetData.
+        mj_forward, they are of the episode before, or 0 after mj_resetData. A robot without an engine - the length
+        of a vector follows where an attribute was before the step, and not where it is.
     """,
     fix="""
         Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
@@ -53,9 +58,17 @@ FORWARD = (
 )
 READ_MUJOCO = "Read after the last mj_step; then call mujoco.mj_forward(model, data) for what follows from positions."
 READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., computeForwardKinematics=True)."
+READ_ATTRIBUTES = "Compute what is observed after the robot has moved."
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
 EXACT = 2e-6  # relative; the last bits of float32 and of sums
 OLD = 1e-4  # An old value differs from the present one by more, in most looks [m], [rad], [m/s]
+COMBINED, FAR_OFF = 1e-4, 0.02  # largest errors of a sum that is an element, and of one that is not, parts of its size
+SUMMED = {
+    "places seen from something": ("position of",),
+    "velocities seen from something": ("velocity of", "angular velocity of", "speed of"),
+}
+SMALLEST = 1e-6  # singular value, part of the largest one
+LOOKS_PER_NUMBER = 4  # that a sum needs
 LATE_LINK = 0.001  # [m]
 
 
@@ -68,6 +81,24 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         yield from old
         if not old:
             yield from _find_elements_of_last_look(world, fix)
+
+
+@judges_records(RULE, "worlds", "attributes", "action effects")
+def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
+    """Yield the vectors that a robot without an engine observes from where it was a step before."""
+    log: AttributeLog | None = records.facts.get("attributes")
+    if log is None or np.isfinite(log.physics_s):
+        return  # the engine tells more
+    if any(finding.rule == "RL115" for finding in records.findings):
+        return  # all that is observed is late
+    names, parts = name_elements(records.require_built())
+    for elements, place in find_old_ways(log, parts):
+        message = (
+            f"{name_part(names[elements])} is a way from where {place} was before the step, and not from where it is"
+        )
+        evidence = {"element": names[elements.start], "value": place}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_ATTRIBUTES)
+        return
 
 
 @judges_trials(RULE, place=10)
@@ -186,8 +217,42 @@ def _find_elements_of_last_look(world: LoggedWorld, fix: str) -> Iterator[RuleFi
     only_earlier = earlier & ~present.any(axis=0) & ~present.any(axis=1, keepdims=True)  # shape (columns, features)
     names, found = name_features(logs[0]), zip(columns, only_earlier, strict=True)
     old = {column: names[int(row.argmax())] for column, row in found if row.any()}
+    for what, kinds in SUMMED.items():
+        of_kind = [place for place, name in enumerate(names) if name.startswith(kinds)]
+        for column in _find_sums(observed[:, columns], now, before, of_kind):
+            old.setdefault(columns[column], what)
     if old:
         yield _describe_old(old, "before the whole step, not of the one after it", fix)
+
+
+def _find_sums(observed: Array, now: Array, before: Array, features: Sequence[int]) -> list[int]:
+    """Return the elements that are a sum of multiples of features at the observation before, such as a difference of
+    two places in some axes, and no such sum of the present state; without those of which the present sum is observed
+    too: they are a history. Shapes (looks, elements), and (looks, numbers) of both states."""
+    size = observed.std(axis=0)
+    fitted = [_fit(part, observed) for part in (before[:, features], now[:, features], now)]
+    if any(one is None for one in fitted[:2]):
+        return []
+    weights, earlier = fitted[0] or (observed, size)
+    present = np.min([one[1] for one in fitted[1:] if one is not None], axis=0)
+    found = []
+    for place in np.flatnonzero((earlier < COMBINED * size) & (present > FAR_OFF * size)).tolist():
+        shown = np.abs(observed - (now[:, features] @ weights[:, place])[:, None]).max(axis=0)
+        if shown.min() > FAR_OFF * size[place]:
+            found.append(place)
+    return found
+
+
+def _fit(features: Array, observed: Array) -> tuple[Array, Array] | None:
+    """Return the weights by which features add up to what is observed, from every other look, and the largest error in
+    the rest of the looks; None for too few looks. Shapes (features, elements) and (elements,)."""
+    half, rest = np.s_[::2], np.s_[1::2]
+    moves = features.std(axis=0) > OLD
+    weights = np.zeros((features.shape[1], observed.shape[1]))
+    weights[moves], _, rank, _ = np.linalg.lstsq(features[half][:, moves], observed[half], rcond=SMALLEST)
+    if len(features) < LOOKS_PER_NUMBER * max(1, int(rank)):
+        return None
+    return weights, np.asarray(np.abs(observed[rest] - features[rest] @ weights).max(axis=0))
 
 
 def _describe_old(old: Mapping[int, str], when: str, fix: str) -> RuleFinding:
