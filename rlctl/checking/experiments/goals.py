@@ -15,6 +15,8 @@ from rlctl.checking.experiments.starts import FIRST, STARTS
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
+from rlctl.checking.snapshots import Beginnings
+from rlctl.checking.term_names import is_about_goals
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import Attribute, read_attributes, read_flag, shape_like
 from rlctl.checking.workspaces import Reach, find_chains, measure_reach
@@ -45,6 +47,7 @@ by itself, and `TURNED` for the way to the goal in the frame of a robot that tur
 which on the observation has another place in the same frame, such as that of an object: that is then the place."""
 TURNED = 2
 TURN_SHIFT, TURN_ERROR = 0.1, 1e-3  # of a goal along each axis, to see how the observation turns it
+LEAST_SCALE, SCALED_ROUNDING = 1e-3, 2e-7  # of a way in the observation, and what float32 makes of it
 TURNS = (2 * np.pi, 360.0)  # one turn [rad, deg]
 TURNED_STEPS = 2  # with the goal a turn further: of the first, progress is the way of the goal too
 SAME_REWARD = 1e-5  # of the rewards, or of 1: what float32 makes of an angle and of another a turn further
@@ -56,6 +59,7 @@ class DrawnPlace:
 
     name: str  # of the attribute
     elements: tuple[int, ...]
+    later: tuple[tuple[int, ...], ...] = ()  # The elements of the goals after it, where there are several
 
     @property
     def size(self) -> int:
@@ -79,10 +83,12 @@ class DrawnPlace:
         """Return the place that an attribute has. Shape (size,)."""
         return attribute.numbers[list(self.elements)]
 
-    def assign(self, attribute: Attribute, place: Numbers) -> None:
-        """Replace the place in the environment; the other elements become those of the copy."""
+    def assign(self, attribute: Attribute, place: Numbers, together: bool = False) -> None:
+        """Replace the place in the environment, and `together` all later goals; the other elements become those of the
+        copy."""
         numbers = attribute.numbers.copy()
-        numbers[list(self.elements)] = place
+        for elements in [self.elements, *(self.later if together else ())]:
+            numbers[list(elements)] = place
         attribute.assign(shape_like(attribute.value, numbers))
 
 
@@ -135,6 +141,7 @@ class GoalTrials:
     """Where the robot is by a turned source, its seed, kind of actions and steps: goals move no robot."""
     turnings: dict[tuple[int, int, str, int], Numbers] = dataclasses.field(default_factory=dict)
     """How the observation turns the way to the goal, by its element and the same."""
+    begun: Beginnings = dataclasses.field(default_factory=Beginnings)
 
     @functools.cached_property
     def goals(self) -> Numbers:
@@ -258,19 +265,39 @@ class AtGoal:
 class GoalEpisode:
     """An episode whose goal is set before each of its later steps."""
 
-    def __init__(self, trials: GoalTrials, seed: int, actions: str = "zero", first: int = 0) -> None:
-        """Reset, and play the first steps with the goal that was drawn; `actions` is a kind of `draw_actions`."""
-        self._trials, self._seed, self._actions = trials, seed, actions
+    def __init__(
+        self, trials: GoalTrials, seed: int, actions: str = "zero", first: int = 0, *, together: bool = True
+    ) -> None:
+        """Reset, and play the first steps with the goal that was drawn; `actions` is a kind of `draw_actions`. Where
+        there are several goals, all are moved `together`, or the first one alone."""
+        self._trials, self._seed, self._actions, self._together = trials, seed, actions, together
         self._goals: list[Numbers | None] = []  # by step
         self._instance = trials.instance
         self._player = EpisodePlayer(self._instance, seed, actions)
-        moment = self._player.reset()
         self._place = trials.drawn.place
+        self.has_succeeded = False  # whether any of its steps was a success
+        if self._resume(first):
+            return
+        moment = self._player.reset()
         self._attribute = self._place.find(self._instance.env)
         self.goal = self._place.pick(self._attribute)
         self.observed = flatten_floats(self._instance.leaves, moment.observation)  # Shape (elements,)
-        self.has_succeeded = False  # whether any of its steps was a success
         self.play([None] * first)
+        if not self.has_ended:
+            trials.begun.keep(self._player, (seed, actions, first), vars(self))
+
+    def _resume(self, first: int) -> bool:
+        """Go on from the last episode's beginning, if it was the same; say whether it was."""
+        kept = self._trials.begun.restore((self._seed, self._actions, first))
+        if kept is None:
+            return False
+        together = self._together
+        vars(self).update(kept)
+        self._together = together
+        self._goals = [None] * first
+        self._player = EpisodePlayer(self._instance, self._seed, self._actions)
+        self._player.resume(first)
+        return True
 
     @property
     def has_ended(self) -> bool:
@@ -280,7 +307,7 @@ class GoalEpisode:
     def step(self, goal: Numbers | None = None) -> GoalStep:
         """Set the goal, if one is given, and take a step."""
         if goal is not None:
-            self._place.assign(self._attribute, goal)
+            self._place.assign(self._attribute, goal, self._together)
             self.goal = goal
         self._goals.append(goal)
         moment = self._player.step()
@@ -333,7 +360,7 @@ class GoalEpisode:
             parts = []
             # The last one leaves the environment as this episode did.
             for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
-                again = GoalEpisode(self._trials, self._seed, self._actions)
+                again = GoalEpisode(self._trials, self._seed, self._actions, together=self._together)
                 again.play([*self._goals[:-1], self.goal + shift])
                 parts.append(again.observed[element : element + self.goal.size])
             *shifted, plain = parts
@@ -412,7 +439,9 @@ def _find_drawn(instance: Instance) -> tuple[list[DrawnPlace], list[str]]:
     """Return the places in attributes that a reset draws by its seed and no step changes, and the names of the others
     that it draws."""
     found = find_drawn(instance, _list_places)
-    candidates = sorted(found.stays, key=lambda name: (found.sizes[name] not in SIZES, name))[:MOST_CANDIDATES]
+    candidates = sorted(
+        found.stays, key=lambda name: (not is_about_goals(name), found.sizes[name] not in SIZES, name)
+    )[:MOST_CANDIDATES]
     return [place for name in candidates for place in found.stays[name]], found.by_chance
 
 
@@ -456,8 +485,12 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
         return []
     drawn = tuple(np.flatnonzero(one.numbers != two.numbers).tolist())
     rows = np.shape(one.value)
-    if len(rows) == 2 and rows[0] > 1 and rows[1] in SIZES[1:] and len(drawn) == size:  # the first of several goals
-        return [DrawnPlace(one.name, tuple(range(rows[1])))]
+    if len(rows) == 2 and rows[0] > 1 and rows[1] in SIZES[1:] and drawn:  # the first of several goals
+        columns = sorted({element % rows[1] for element in drawn})
+        if len(drawn) == rows[0] * len(columns) and len(columns) > 1:  # the same axes of each
+            of_rows = [tuple(row * rows[1] + column for column in columns) for row in range(rows[0])]
+            return [DrawnPlace(one.name, of_rows[0], tuple(of_rows[1:]))]
+        return []
     if len(drawn) not in SIZES or len(drawn) < min(2, size):
         return []
     found = [DrawnPlace(one.name, tuple(range(size)))] if size in SIZES else []
@@ -492,8 +525,13 @@ def _find_turned(instance: Instance, place: DrawnPlace) -> list[Source]:
     found: list[Source] = []
     for element in range(plain.size - size + 1):
         turn = turns[:, element : element + size]
-        is_rotation = np.abs(turn @ turn.T - np.eye(size)).max() < TURN_ERROR
-        is_plain = np.abs(np.abs(turn) - np.eye(size)).max() < TURN_ERROR
+        scale = float(np.sqrt(np.square(turn).sum() / size))  # of a unit of the observation
+        if scale < LEAST_SCALE:
+            continue
+        rounding = SCALED_ROUNDING * np.abs(plain).max() / (scale * TURN_SHIFT)
+        error, turn = TURN_ERROR + rounding, turn / scale
+        is_rotation = np.abs(turn @ turn.T - np.eye(size)).max() < error
+        is_plain = np.abs(np.abs(turn) - np.eye(size)).max() < error and abs(scale - 1.0) < error
         if is_rotation and not is_plain:
             found.append((element, TURNED))
     return found

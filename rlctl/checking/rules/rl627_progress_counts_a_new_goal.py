@@ -74,7 +74,7 @@ def _are_enough(switches: Sequence[_Switch]) -> bool:
 
 def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Switch | None:
     """Put the goal at a place by a source; return what the next steps pay if another goal follows."""
-    episode = GoalEpisode(trials, seed, "zero", PLACED_STEPS)
+    episode = GoalEpisode(trials, seed, "zero", PLACED_STEPS, together=False)
     if episode.has_ended or not np.array_equal(trials.drawn.place.read(trials.instance.env), episode.goal):
         return None  # it has gone on to another goal already
     is_absolute = np.allclose(_read(episode, shown), episode.goal, atol=1e-4)
