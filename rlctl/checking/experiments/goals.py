@@ -101,6 +101,12 @@ class DrawnGoal:
     turned: Sequence[Source]  # Where the observation has its difference to something, turned
     goals: Mapping[int, Sequence[float]]  # by seed
     reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
+    scales: Mapping[int, float] = dataclasses.field(default_factory=dict)
+    """How many units of the observation a unit of the place is, by the elements of `turned`."""
+
+    def read_scale(self, element: int) -> float:
+        """Return how many units of the observation a unit of the place is, where it has the way to it."""
+        return self.scales.get(element, 1.0)
 
     @property
     def name(self) -> str:
@@ -370,7 +376,8 @@ class GoalEpisode:
     def measure_distance(self, source: Source) -> float:
         """Return how far the goal is from the robot by a source."""
         if source[1]:
-            return float(np.linalg.norm(read_part(source, self.observed[None], self.goal.size)))
+            part = read_part(source, self.observed[None], self.goal.size)
+            return float(np.linalg.norm(part)) / self._trials.drawn.read_scale(source[0])
         return float(np.linalg.norm(self.read(source) - self.goal))
 
     def play(self, goals: Iterable[Numbers | None]) -> list[GoalStep]:
@@ -407,7 +414,8 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
         raise NotJudged("reset takes no seed (RL202)")
     places, by_chance = _find_drawn(instance)
     for place in places:
-        copies, turned = find_copies(instance, place), _find_turned(instance, place)
+        copies, scales = find_copies(instance, place), _find_turned(instance, place)
+        turned = [(element, TURNED) for element in scales]
         if copies or turned:
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
@@ -415,7 +423,7 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
                     break
                 instance.reset(seed)
                 goals[seed] = place.read(instance.env).tolist()
-            drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies))
+            drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies), scales)
             yield Fact("goals", drawn)
             yield from judges_goals.judge(GoalTrials(instance, drawn))
             return
@@ -514,15 +522,16 @@ def find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> l
     ]
 
 
-def _find_turned(instance: Instance, place: DrawnPlace) -> list[Source]:
-    """Return where the observation has the way to the place in a frame that is turned against the world's."""
+def _find_turned(instance: Instance, place: DrawnPlace) -> dict[int, float]:
+    """Return where the observation has the way to the place in a frame that is turned against the world's, or in
+    another unit; and how many of its units a unit of the place is."""
     size = place.size
     plain = _observe(instance, place, 0.0)
     shifted = [_observe(instance, place, 1.0, TURN_SHIFT * axis) for axis in np.eye(size)]
     if size < 2 or any(row.shape != plain.shape for row in shifted):
-        return []
+        return {}
     turns = np.stack([row - plain for row in shifted]) / TURN_SHIFT  # shape (size, elements)
-    found: list[Source] = []
+    found: dict[int, float] = {}
     for element in range(plain.size - size + 1):
         turn = turns[:, element : element + size]
         scale = float(np.sqrt(np.square(turn).sum() / size))  # of a unit of the observation
@@ -533,7 +542,7 @@ def _find_turned(instance: Instance, place: DrawnPlace) -> list[Source]:
         is_rotation = np.abs(turn @ turn.T - np.eye(size)).max() < error
         is_plain = np.abs(np.abs(turn) - np.eye(size)).max() < error and abs(scale - 1.0) < error
         if is_rotation and not is_plain:
-            found.append((element, TURNED))
+            found[element] = scale if abs(scale - 1.0) > error else 1.0
     return found
 
 

@@ -66,7 +66,7 @@ def _find_wrong_frame(trials: GoalTrials, element: int) -> str:
         episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
         if episode.has_ended:
             continue
-        turn = episode.read_turn(element)
+        turn = episode.read_turn(element) / trials.drawn.read_scale(element)
         for frame, quaternion in _read_orientations(trials.instance).items():
             matrices = [m for m in _list_turns(quaternion, len(turn)) if np.abs(m - m.T).max() >= LEAST_TURN]
             if any(_is_same_turn(turn, matrix.T) for matrix in matrices):

@@ -83,7 +83,7 @@ def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Swit
         # From where the observation has the way to the goal: the robot, or what carries it.
         begin = np.zeros(place.size) if is_absolute else episode.read(shown)
         episode.step(place)
-        seen = _read(episode, shown)
+        seen = _read(episode, shown) / trials.drawn.read_scale(shown[0])
         off = float(np.linalg.norm(seen - place)) if is_absolute else float(np.linalg.norm(seen))
         expected = 0.0 if is_absolute else float(np.linalg.norm(place - begin))
         is_another = episode.has_moved_on or abs(off - expected) > LEAST_WAY * float(np.linalg.norm(trials.range))
