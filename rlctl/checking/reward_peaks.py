@@ -22,7 +22,7 @@ Numbers = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Peak:
-    """A place that pays more than those nearer to the success, and all on the other side of it."""
+    """A place that pays more than the one next to the success, and than all on the other side of it."""
 
     axis: int
     offset: float  # of the goal from where it is a success
@@ -63,7 +63,7 @@ def _find_peak(trials: GoalTrials, source: Source, seed: int, axis: int, room: f
     for sign, side in sides.items():
         number = int(np.argmax([reward for _, reward in side]))
         offset, reward = side[number]
-        others = [other for _, other in [*side[:number], *sides[-sign]]]
+        others = [other for _, other in [side[0], *sides[-sign]]]
         if number and reward > max(others) + least and (at_goal is None or reward > at_goal + least):
             return Peak(axis, offset, reward, max(side[0][1], sides[-sign][0][1]))
     return None
