@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.drawn_goals import Source
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, Source
+from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.points import PointReader
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.values import flatten_action

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiments.goals import GoalEpisode, GoalTrials, Source
+from rlctl.checking.drawn_goals import Source
+from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.records import FIRST_SEED
 
 FIRST_STEPS = 10  # with the action that the episode holds, so that the robot is somewhere else in each

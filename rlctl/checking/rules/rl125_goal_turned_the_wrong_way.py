@@ -8,7 +8,8 @@ import numpy as np
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_world
-from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, judges_goals
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage

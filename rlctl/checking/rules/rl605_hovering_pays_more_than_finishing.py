@@ -6,17 +6,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking import rewards
+from rlctl.checking.drawn_goals import Numbers, Source
 from rlctl.checking.episode import zero_action
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.goals import (
-    GoalEpisode,
-    GoalStep,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-)
+from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
+from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 

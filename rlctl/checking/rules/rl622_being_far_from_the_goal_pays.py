@@ -6,13 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import (
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-)
+from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.leaving import Leaving, find_leaving
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.reward_peaks import Peak, find_peaks

@@ -4,7 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import GoalEpisode, GoalStep, GoalTrials, Numbers, judges_goals
+from rlctl.checking.drawn_goals import Numbers
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 

@@ -4,15 +4,9 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import (
-    NEAR,
-    PLACED_STEPS,
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-)
+from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.goals import NEAR, judges_goals
+from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.transitions import find_float_leaves

@@ -5,15 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import (
-    HELD_STEPS,
-    PLACED_STEPS,
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-)
+from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import HELD_STEPS, PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
