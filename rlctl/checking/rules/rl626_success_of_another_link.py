@@ -20,7 +20,9 @@ RULE = Rule(
         The observation shows the way from one link to the goal, and is_success is true where another link is at
         the goal. The check put the goal at each link to see it. Most often a link's index or name is that of its
         neighbour, or what was meant is the tip, and what is read is the body that carries it. The same of an
-        object: its way to the goal is observed, or it is the achieved_goal, and success is where the hand is.
+        object: its way to the goal is observed, or it is the achieved_goal, and success is where the hand is; or
+        what is observed as its way is not 0 where it is at the goal, as with the goal in the world and the object
+        in the robot's frame.
     """,
     fix="Use the same link, and the same point of it, in the observation, in the reward and for success.",
 )
