@@ -177,7 +177,7 @@ class GoalEpisode:
     ) -> None:
         """Reset, and play the first steps with the goal that was drawn; `actions` is a kind of `draw_actions`. Where
         there are several goals, all are moved `together`, or the first one alone."""
-        self._trials, self._seed, self._actions, self._together = trials, seed, actions, together
+        self._trials, self._seed, self._actions, self._first, self._together = trials, seed, actions, first, together
         self._goals: list[Numbers | None] = []  # by step
         self._instance = trials.instance
         self._player = EpisodePlayer(self._instance, seed, actions)
@@ -267,8 +267,10 @@ class GoalEpisode:
             parts = []
             # The last one leaves the environment as this episode did.
             for shift in [*TURN_SHIFT * np.eye(self.goal.size), np.zeros(self.goal.size)]:
-                again = GoalEpisode(self._trials, self._seed, self._actions, together=self._together)
-                again.play([*self._goals[:-1], self.goal + shift])
+                # With the same first steps, so that they need not be played again.
+                first = min(self._first, len(self._goals) - 1)
+                again = GoalEpisode(self._trials, self._seed, self._actions, first, together=self._together)
+                again.play([*self._goals[first:-1], self.goal + shift])
                 parts.append(again.observed[element : element + self.goal.size])
             *shifted, plain = parts
             self._trials.turnings[key] = (np.stack(shifted, axis=1) - plain[:, None]) / TURN_SHIFT

@@ -183,14 +183,14 @@ class Beginnings:
         if self._snapshot is not None:
             self._snapshot.forget()
             self._snapshot = None
-        if self._is_useful is None:
-            seconds = episode.instance.progress.mean_s("reset", fewest=1) or 0.0
-            self._is_useful = seconds > SLOW_S
+        is_first = self._is_useful is None
+        if is_first:
+            self._is_useful = (episode.instance.progress.mean_s("reset", fewest=1) or 0.0) > SLOW_S
         if not self._is_useful:
             return
         try:
             snapshot = Snapshot(episode.instance)
-            self._is_useful = snapshot.is_faithful(episode)
+            self._is_useful = not is_first or snapshot.is_faithful(episode)
         except LookupError:
             self._is_useful = False
         if self._is_useful:
