@@ -76,7 +76,8 @@ class Snapshot:
                 rows.append(np.append(flatten_floats(self._instance.leaves, moment.observation), moment.reward_number))
             tries.append(np.array(rows))
         self.restore()
-        return tries[0].shape == tries[1].shape and np.allclose(*tries, rtol=SAME, atol=SAME, equal_nan=True)
+        one, two = tries
+        return one.shape == two.shape and np.allclose(one, two, rtol=SAME, atol=SAME, equal_nan=True)
 
     def _add_client(self, p: ClientCalls) -> None:
         state = p.saveState()
