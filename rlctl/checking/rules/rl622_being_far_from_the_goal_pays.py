@@ -101,6 +101,8 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     if axes:
         yield _describe_signed(trials, axes, shown)
         return
+    if len(source) > 2 or not source[1]:
+        return  # what has to be at the goal is not observed relative to it: RL626
     room = [_find_room(trials, axis) if moved[axis] else 0.0 for axis in range(len(moved))]
     if peaks := find_peaks(trials, source, room):
         yield _describe_peak(trials, peaks)
