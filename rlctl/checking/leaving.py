@@ -33,7 +33,7 @@ class Leaving:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Look:
+class _LeavingStep:
     reward: float
     action: Numbers
     change: Numbers  # of the action
@@ -54,7 +54,7 @@ def find_leaving(trials: GoalTrials, source: Source) -> Leaving | None:
     return None
 
 
-def _is_at_rest(look: _Look, item: str, span: float) -> bool:
+def _is_at_rest(look: _LeavingStep, item: str, span: float) -> bool:
     return bool(np.linalg.norm(look.after[item] - look.before[item]) < RESTS * span)
 
 
@@ -71,7 +71,7 @@ def _find_items(trials: GoalTrials, source: Source) -> list[str]:
     return sorted(common or ())
 
 
-def _play(trials: GoalTrials) -> Iterator[_Look]:
+def _play(trials: GoalTrials) -> Iterator[_LeavingStep]:
     instance = trials.instance
     for number, kind in enumerate(KINDS):
         episode = EpisodePlayer(instance, FIRST_SEED + number, kind, max_steps=STEPS)
@@ -83,11 +83,11 @@ def _play(trials: GoalTrials) -> Iterator[_Look]:
             after, action = reader.read(), flatten_action(instance.action_leaves, moment.action)
             change = np.zeros(action.size) if earlier is None else action - earlier
             if not any(moment.flags):
-                yield _Look(moment.reward_number, action, change, before, after)
+                yield _LeavingStep(moment.reward_number, action, change, before, after)
             before, earlier = after, action
 
 
-def _fit(looks: list[_Look], item: str, items: list[str], span: float) -> Leaving | None:
+def _fit(looks: list[_LeavingStep], item: str, items: list[str], span: float) -> Leaving | None:
     """Return the point whose distance explains most of what the actions leave of the rewards, if more pays more."""
     rewards = np.array([look.reward for look in looks])
     actions, changes = np.array([look.action for look in looks]), np.array([look.change for look in looks])
