@@ -1,12 +1,12 @@
-"""RL605, RL622, RL627: what plays that reach the goal pay, where the reward is one number and the engine NumPy."""
+"""RL605, RL622, RL626, RL627: what plays that reach the goal pay, where the reward is one number."""
 
 import pytest
 
 from tests.checking.judging import case, check_case, mark_slow
 
 
-def broken(name, twin, **settings):
-    return case(f"broken_reaching.py:{name}", (name[:5], "warning"), twin=f"broken_reaching.py:{twin}", **settings)
+def broken(name, twin, file="broken_reaching.py", **settings):
+    return case(f"{file}:{name}", (name[:5], "warning"), twin=f"{file}:{twin}", **settings)
 
 
 CASES = [
@@ -16,6 +16,8 @@ CASES = [
     broken("RL622DiscLeavesBlock", "DiscWithBlock", slow=True),
     broken("RL622DiscOtherAxes", "DiscWithBlock", slow=True),
     broken("RL622PointCopterAbove", "PointCopter", slow=True),
+    broken("RL626SledTwoFrames", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
+    broken("RL622SledLeavesCube", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
 ]
 
 
