@@ -151,7 +151,7 @@ MAY_SHARE_A_NAME = {
     "rlctl/recipe/network_parameters.py: Activation",  # a value of a recipe's key
     "rlctl/task/events/event.py: Steps",  # for task authors
     "rlctl/checking/experiments/batches.py: Rows",
-    "rlctl/checking/experiments/goals.py: Source",
+    "rlctl/checking/drawn_goals.py: Source",
     "rlctl/checking/experiments/held.py: Rows",
     "rlctl/checking/kept_state.py: Observed",
     "rlctl/checking/rules/rl614_hindsight_reward_differs.py: Rows",

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_world
-from rlctl.checking.experiments.goals import DrawnGoal, DrawnPlace, GoalEpisode, GoalTrials
+from rlctl.checking.drawn_goals import DrawnGoal, DrawnPlace
+from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED
 from rlctl.environments.bullet_clients import ClientCalls

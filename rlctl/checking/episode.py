@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -75,14 +76,18 @@ class EpisodePlayer:
 
     def reset(self) -> Moment:
         """Begin the episode."""
-        self.steps, self.ended = 0, "" if self.max_steps else "steps"
-        space, seed = self.instance.env.action_space, self.seed if self.action_seed is None else self.action_seed
-        drawn = draw_actions(space, self.actions, seed) if self.sequence is None else self.sequence
-        self._next: Iterator[Any] = iter(drawn)
+        self.resume(0)
         returned = self.instance.reset(self.seed, self.number)
         if isinstance(returned, tuple) and len(returned) == 2:
             return Moment(0, None, returned[0], info=returned[1])
         return Moment(0, None, returned, form=_form(returned))
+
+    def resume(self, steps: int) -> None:
+        """Go on without a reset, after so many steps: for who has put the environment back to its state then."""
+        self.steps, self.ended = steps, "" if steps < self.max_steps else "steps"
+        space, seed = self.instance.env.action_space, self.seed if self.action_seed is None else self.action_seed
+        drawn = draw_actions(space, self.actions, seed) if self.sequence is None else self.sequence
+        self._next: Iterator[Any] = itertools.islice(drawn, steps, None)
 
     def step(self) -> Moment:
         """Take one step."""

@@ -243,6 +243,7 @@ class Instance:
         self.connected = connected
         self.progress = context.progress
         self.timers: Mapping[str, Timer] = {}  # by the name of the call they time
+        self.resets = 0  # how often it was reset
 
     @property
     def max_steps(self) -> int | None:
@@ -275,6 +276,7 @@ class Instance:
 
     def reset(self, seed: int, episode: int = 0) -> Any:
         """Reset with a seed, where reset takes one, and return what it returns."""
+        self.resets += 1
         self.progress.episode(episode, seed)
         keywords = {"seed": seed} if self.accepts_seed else {}
         return self.call("reset", self.env.reset, **keywords)

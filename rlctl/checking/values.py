@@ -181,7 +181,7 @@ def read_attributes(env: Any) -> dict[str, Attribute]:
                 items_of_value = [(i, item) for i, item in enumerate(value) if _is_quantity(item)]
                 for i, item in items_of_value if len(items_of_value) == len(value) else ():
                     attributes[f"{path}[{i}]"] = Attribute(f"{path}[{i}]", owner, key, copy.deepcopy(item), i)
-            elif depth < DEEPEST and id(value) not in seen and _is_own(value):
+            elif depth < DEEPEST and id(value) not in seen and (isinstance(value, dict) or is_own_object(value)):
                 visit(value, path, depth + 1)
 
     visit(find_author(env), "self", 0)
@@ -199,9 +199,8 @@ def _is_quantity(value: Any) -> bool:
     return len(shapes) == len(value) and len(set(shapes)) == 1 and len(shapes) * math.prod(shapes[0]) <= MOST_NUMBERS
 
 
-def _is_own(value: Any) -> bool:
-    if isinstance(value, dict):
-        return True
+def is_own_object(value: Any) -> bool:
+    """Say whether a value is an object of a class of the environment's author."""
     is_object = hasattr(value, "__dict__") and not inspect.isroutine(value) and not inspect.isclass(value)
     return is_object and not inspect.ismodule(value) and type(value).__module__.partition(".")[0] not in LIBRARIES
 

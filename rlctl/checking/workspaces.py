@@ -68,20 +68,49 @@ def find_chains(env: Any, clients: Iterable[int]) -> Iterator[Chain]:
             yield _mujoco_chain(mujoco, model, data, joints)
 
 
-def find_objects(env: Any, clients: Iterable[int]) -> dict[str, Numbers]:
-    """Return where the free bodies without joints of an environment are, by name, in its clients of PyBullet or in
-    MuJoCo [m]. Shape (3,) each."""
-    places: dict[str, Numbers] = {}
+@dataclasses.dataclass(frozen=True)
+class FreeObject:
+    """A body without joints that nothing holds."""
+
+    read: Callable[[], Numbers]  # its position [m]. Shape (3,)
+    shift: Callable[[Numbers], None]  # moves it at once by some axes of the world [m]. Shape (up to 3,)
+
+
+def find_objects(env: Any, clients: Iterable[int]) -> dict[str, FreeObject]:
+    """Return the free bodies without joints of an environment, by name, in its clients of PyBullet or in MuJoCo."""
+    objects: dict[str, FreeObject] = {}
     for client in clients:
         for body in read_world(client).bodies:
             if body.is_free and not body.joints:
-                places[body.name] = np.array(ClientCalls(client).getBasePositionAndOrientation(body.id)[0])
+                objects[body.name] = _bullet_object(ClientCalls(client), body.id)
     if (simulation := find_mujoco(env)) is not None:
         model, data = simulation
         for body in mujoco_worlds.read_world(model).bodies:
             if body.is_free and not body.joints:
-                places[body.name] = np.array(data.qpos[model.jnt_qposadr[model.body_jntadr[body.id]] :][:3])
-    return places
+                objects[body.name] = _mujoco_object(data, int(model.jnt_qposadr[model.body_jntadr[body.id]]))
+    return objects
+
+
+def _bullet_object(p: ClientCalls, body: int) -> FreeObject:
+    def read() -> Numbers:
+        return np.array(p.getBasePositionAndOrientation(body)[0])
+
+    def shift(by: Numbers) -> None:
+        position, orientation = p.getBasePositionAndOrientation(body)
+        velocity = p.getBaseVelocity(body)
+        moved = np.array(position)
+        moved[: by.size] += by
+        p.resetBasePositionAndOrientation(body, moved.tolist(), orientation)
+        p.resetBaseVelocity(body, *velocity)  # the call before has stopped it
+
+    return FreeObject(read, shift)
+
+
+def _mujoco_object(data: Any, first: int) -> FreeObject:
+    def shift(by: Numbers) -> None:
+        data.qpos[first : first + by.size] += by
+
+    return FreeObject(lambda: np.array(data.qpos[first : first + 3]), shift)
 
 
 def _bullet_chain(p: ClientCalls, body: WorldBody) -> Chain:

@@ -7,16 +7,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from rlctl.checking.command_sweeps import CommandSweep, sweep_command
+from rlctl.checking.drawn_goals import DrawnGoal, DrawnPlace, Numbers
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
-from rlctl.checking.experiments.goals import (
-    DrawnGoal,
-    DrawnPlace,
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    find_copies,
-    find_drawn,
-)
+from rlctl.checking.experiments.goals import find_copies, find_drawn
+from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged

@@ -8,7 +8,8 @@ import numpy as np
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_world
-from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, judges_goals
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
@@ -66,7 +67,7 @@ def _find_wrong_frame(trials: GoalTrials, element: int) -> str:
         episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
         if episode.has_ended:
             continue
-        turn = episode.read_turn(element)
+        turn = episode.read_turn(element) / trials.drawn.read_scale(element)
         for frame, quaternion in _read_orientations(trials.instance).items():
             matrices = [m for m in _list_turns(quaternion, len(turn)) if np.abs(m - m.T).max() >= LEAST_TURN]
             if any(_is_same_turn(turn, matrix.T) for matrix in matrices):

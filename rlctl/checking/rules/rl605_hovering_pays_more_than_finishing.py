@@ -6,10 +6,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking import rewards
+from rlctl.checking.drawn_goals import Numbers, Source
 from rlctl.checking.episode import zero_action
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.goals import GoalEpisode, GoalTrials, Source, judges_goals
+from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
+from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -22,7 +24,7 @@ RULE = Rule(
         staying there earns more than finishing, so the policy learns to hover. rlctl repeated an episode that
         finished, and stopped shortly before its end; or every recorded success pays less than the steps would
         have paid that were left, by what episodes without a success earn. Or the check moved the goal: next to the
-        robot, which rests, each step pays, and a success ends that for less.
+        robot, which rests or which the goal accompanies, each step pays, and a success ends that for less.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
@@ -35,6 +37,7 @@ STOPS = (1, 2, 4, 8)  # steps before the end of a finished episode, to stop ther
 CLEARLY = 0.1  # How much more stopping has to earn than finishing
 FEWEST, EARLY = 3, 0.5  # successes, and the part of the longest episode in which they are
 FAR_MORE = 2.0  # times as much as success; it may be worth less to stay where others were
+MOST_LOST = 0.5  # times as much as success, discounted, where the undiscounted sum is `FAR_MORE`
 LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
 
 
@@ -70,13 +73,15 @@ def _compare_with_moved_goal(records: Records) -> Iterator[RuleFinding]:
     longest = records.require_built().max_steps or max(one.steps for one in rewards.require_rewarded(records))
     least = min(incomes, key=lambda one: one.per_step)
     hovering = rewards.discounted_steps(least.per_step, longest - FIRST_STEPS)
+    whole = least.per_step * (longest - FIRST_STEPS)
     paid = max(one.success for one in incomes)
-    if hovering <= FAR_MORE * max(paid, 0.0):
+    is_more = hovering > FAR_MORE * max(paid, 0.0)
+    # Long episodes may not be discounted so much, and evaluations are not discounted at all.
+    if not is_more and not (whole > FAR_MORE * max(paid, 0.0) and hovering > MOST_LOST * paid):
         return
-    message = (
-        f"success ends the episode and pays {paid:.4g}; resting {least.distance:.3g} from the goal pays"
-        f" {least.per_step:.3g} in each step, {hovering:.4g} until step {longest} (discount {rewards.DISCOUNT})"
-    )
+    staying = f"staying {least.distance:.3g} from the goal pays {least.per_step:.3g} in each step"
+    message = f"success ends the episode and pays {paid:.4g}; {staying}, {whole:.4g} until step {longest}"
+    message += f", or {hovering:.4g} with a discount of {rewards.DISCOUNT}"
     evidence = {"seed": least.seed, "value": hovering, "expected": f"below {paid:.6g}", "per_step": least.per_step}
     yield RuleFinding(RULE, message, evidence)
 
@@ -115,13 +120,28 @@ def _measure_income(trials: GoalTrials, source: Source, seed: int) -> Income | N
             continue
         distance = float(np.linalg.norm(way))
         is_still = not resting.has_ended and np.linalg.norm(resting.read(source) - place) <= STILL * distance
+        if not is_still:
+            resting, steps = _accompany(trials, source, seed, way)
+            if resting.has_succeeded:
+                continue
+            if resting.has_ended:
+                return None
         # What is paid for a change of the distance is paid once, when the goal is moved.
-        late = min(step.reward for step in steps[RESTING_STEPS // 2 :]) if is_still else 0.0
+        late = float(np.mean([step.reward for step in steps[len(steps) // 2 :]]))
         # A source that is constant is where a robot begins, and not where it is now.
-        if is_still and not resting.hold(place, source).succeeds:
+        if not resting.hold(resting.read(source), source).succeeds:
             return None
         return Income(seed, late, distance, success.reward)
     return None
+
+
+def _accompany(trials: GoalTrials, source: Source, seed: int, way: Numbers) -> tuple[GoalEpisode, list[GoalStep]]:
+    """Play steps in which the goal stays as far from a robot that moves; return the episode, too."""
+    episode = GoalEpisode(trials, seed, "zero", FIRST_STEPS)
+    steps: list[GoalStep] = []
+    while len(steps) < 2 * RESTING_STEPS and not episode.has_ended:
+        steps.append(episode.step(episode.read(source) + way))
+    return episode, steps
 
 
 def _compare_successes(records: Records) -> Iterator[RuleFinding]:

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking import rewards
+from rlctl.checking.drawn_goals import Source
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.goals import PLACED_STEPS, GoalEpisode, GoalTrials, Source, judges_goals
+from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.turned import TurnedRobot, judges_turned
+from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs

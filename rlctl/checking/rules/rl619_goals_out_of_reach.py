@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.checking import rewards
+from rlctl.checking.drawn_goals import DrawnGoal, Numbers, Source, find_sources, read_place
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.goals import DrawnGoal, Numbers, Source, find_sources, read_place
 from rlctl.checking.records import Records
 from rlctl.checking.regression import action_terms, fit_terms
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity

@@ -6,14 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import (
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-)
+from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
+from rlctl.checking.leaving import Leaving, find_leaving
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
+from rlctl.checking.reward_peaks import Peak, find_peaks
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 
 RULE = Rule(
@@ -23,7 +21,9 @@ RULE = Rule(
     meaning="""
         The further away the goal is, the larger is the reward, to both sides; or every failure pays more than
         success, which goes on; or a goal that goes away pays more than one that comes nearer; or the reward rises
-        through the goal and beyond, as a sum of differences with their signs does. The check played
+        through the goal and beyond, as a sum of differences with their signs does; or it rises as the robot goes
+        away from the object that it has to bring to the goal; or it is highest with the goal somewhere else than where
+        it is a success. The check played
         the same steps again, and put the goal, or the command, where is_success is true, and at several
         distances from there. So the policy learns to keep away from the goal. Most often a sign is wrong, or an
         error is paid instead of a function that falls with it, or differences are added instead of their sizes.
@@ -66,11 +66,18 @@ _Describe = Callable[[GoalTrials, Sequence[int], Sequence[float]], RuleFinding]
 def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     """Put the goal where the robot is, and to either side."""
     source, reports_success = _find_source(trials)
+    if trials.drawn.place.later:
+        source = None  # each of several goals is reached by another step
     if not reports_success:
         yield Skipped(RULE.id, "no success is reported", applies=False)
         return
     is_held = source is None  # whether a success takes longer than the steps that are compared
-    source = trials.at_goal.source if source is None else source
+    at_goal = trials.at_goal.source
+    leaving = None if at_goal is None else find_leaving(trials, at_goal)
+    if leaving is not None:
+        yield _describe_leaving(trials, leaving)
+        return
+    source = at_goal if source is None else source
     if source is None:
         yield Skipped(RULE.id, "no goal next to the robot was a success")
         return
@@ -93,6 +100,27 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     axes = [axis for axis in axes if moved[axis]]
     if axes:
         yield _describe_signed(trials, axes, shown)
+        return
+    if len(source) > 2 or not source[1]:
+        return  # what has to be at the goal is not observed relative to it: RL626
+    room = [_find_room(trials, axis) if moved[axis] else 0.0 for axis in range(len(moved))]
+    if peaks := find_peaks(trials, source, room):
+        yield _describe_peak(trials, peaks)
+
+
+def _describe_peak(trials: GoalTrials, peaks: Sequence[Peak]) -> RuleFinding:
+    name, places = trials.drawn.name, list_names([f"{peak.offset:.3g}" for peak in peaks])
+    message = f"the reward is highest with {trials.drawn.name_axis(peaks[0].axis)} {places} away from where {name} is a"
+    message += f" success, in {len(peaks)} episodes: {peaks[0].reward:.4g} there, and {peaks[0].nearest:.4g} next to"
+    evidence = {"element": name, "value": peaks[0].reward, "expected": f"below {peaks[0].nearest:.6g}"}
+    return RuleFinding(RULE, f"{message} the success", evidence)
+
+
+def _describe_leaving(trials: GoalTrials, leaving: Leaving) -> RuleFinding:
+    what = "goes away" if leaving.is_change else "is"
+    message = f"the reward rises by {leaving.slope:.3g} for each unit that {leaving.point} {what} from {leaving.item},"
+    message += f" which has to be brought to {trials.drawn.name} ({leaving.steps} steps in which it rests)"
+    return RuleFinding(RULE, message, {"element": trials.drawn.name, "value": leaving.slope, "expected": "below 0"})
 
 
 def _find_signed(

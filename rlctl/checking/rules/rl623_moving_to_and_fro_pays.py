@@ -4,7 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import GoalEpisode, GoalStep, GoalTrials, Numbers, judges_goals
+from rlctl.checking.drawn_goals import Numbers
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -28,6 +30,7 @@ MOST_GOALS = 3  # of other episodes, that are tried where the first is reached a
 PART = 0.04  # of the goals' range: how far the goal is moved
 DIRECTIONS = np.array([[1.0, 0.62, 0.35], [-0.47, 1.0, -0.71]])  # no axis, in case the robot is beside the goal
 LEAST = 1e-6  # differences of rewards that count, of their size
+SMALL = 0.05  # part of what a way of the goal pays, that is no gain
 SAME = 0.4  # part by which the gain of loops may differ, and that of half the way from half the gain
 
 
@@ -77,6 +80,8 @@ def _measure_gains(trials: GoalTrials, one: Sequence[GoalStep], near: Numbers, f
     alone = np.where(np.arange(2 * LOOPS) % 2 == 0, rewards[1], rewards[0])
     gains = (rewards[2] - alone).reshape(LOOPS, 2).sum(axis=1)
     least = LEAST * max(1.0, float(np.abs(rewards).max()))
+    # A robot that moves meanwhile is paid by where it is, too: by a small part of the way of the goal.
+    least = max(least, SMALL * float(np.abs(rewards[2] - alone).max()))
     return np.where(np.abs(gains) > least, gains, 0.0)
 
 

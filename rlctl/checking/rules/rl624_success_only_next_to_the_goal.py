@@ -4,7 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import GoalTrials, Numbers, Source, judges_goals, measure_distances
+from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import GoalTrials, measure_distances
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 

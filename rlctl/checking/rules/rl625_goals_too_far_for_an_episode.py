@@ -5,15 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import (
-    TURNED,
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-    measure_distances,
-)
+from rlctl.checking.drawn_goals import TURNED, Numbers, Source
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials, measure_distances
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -36,7 +30,7 @@ SLOW = 0.25  # part of the usual distance
 MOVED = 1e-6  # part of the usual distance: what the action changes at least
 
 
-@judges_goals(RULE)
+@judges_goals(RULE, place=1)  # it plays whole episodes: the other rules come before
 def _compare_ways(trials: GoalTrials) -> Iterator[ChildMessage]:
     """Play episodes with held actions, and compare how far they lead with how far the goals are."""
     source = trials.at_goal.source
@@ -45,7 +39,10 @@ def _compare_ways(trials: GoalTrials) -> Iterator[ChildMessage]:
         return
     usual = float(np.median(measure_distances(trials, source)))
     farthest, steps = 0.0, 0
-    for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
+    for number, seed in enumerate(range(FIRST_SEED, FIRST_SEED + EPISODES)):
+        if trials.instance.context.budget.seconds_left < _estimate_seconds(trials, source):
+            yield Skipped(RULE.id, f"time is left for {number} of {EPISODES} episodes")
+            return
         held = _measure_way(trials, source, seed, "repeated", SLOW * usual)
         if held is None:
             return
@@ -59,6 +56,14 @@ def _compare_ways(trials: GoalTrials) -> Iterator[ChildMessage]:
     how = f"with {EPISODES} actions, each held for a whole episode ({steps} steps)"
     message = f"{name} is {usual:.3g} away at the start (median); {how}, the robot gets {farthest:.3g} far at most"
     yield RuleFinding(RULE, message, {"element": name, "seed": FIRST_SEED, "value": farthest, "expected": usual})
+
+
+def _estimate_seconds(trials: GoalTrials, source: Source) -> float:
+    """Return how long the two episodes of a seed may take [s]."""
+    longest = trials.instance.max_steps or trials.instance.context.longest_episode or LENGTHS[-1]
+    steps = sum(min(length, longest) for length in LENGTHS)
+    plays = trials.drawn.place.size + 1 if source[1] == TURNED else 1
+    return 2 * plays * steps * (trials.instance.progress.mean_s("step") or 0.0)
 
 
 def _measure_way(

@@ -5,15 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rlctl.checking.experiments.goals import (
-    HELD_STEPS,
-    PLACED_STEPS,
-    GoalEpisode,
-    GoalTrials,
-    Numbers,
-    Source,
-    judges_goals,
-)
+from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_episodes import HELD_STEPS, PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -74,7 +68,7 @@ def _are_enough(switches: Sequence[_Switch]) -> bool:
 
 def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Switch | None:
     """Put the goal at a place by a source; return what the next steps pay if another goal follows."""
-    episode = GoalEpisode(trials, seed, "zero", PLACED_STEPS)
+    episode = GoalEpisode(trials, seed, "zero", PLACED_STEPS, together=False)
     if episode.has_ended or not np.array_equal(trials.drawn.place.read(trials.instance.env), episode.goal):
         return None  # it has gone on to another goal already
     is_absolute = np.allclose(_read(episode, shown), episode.goal, atol=1e-4)
@@ -83,7 +77,7 @@ def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Swit
         # From where the observation has the way to the goal: the robot, or what carries it.
         begin = np.zeros(place.size) if is_absolute else episode.read(shown)
         episode.step(place)
-        seen = _read(episode, shown)
+        seen = _read(episode, shown) / trials.drawn.read_scale(shown[0])
         off = float(np.linalg.norm(seen - place)) if is_absolute else float(np.linalg.norm(seen))
         expected = 0.0 if is_absolute else float(np.linalg.norm(place - begin))
         is_another = episode.has_moved_on or abs(off - expected) > LEAST_WAY * float(np.linalg.norm(trials.range))

@@ -98,12 +98,17 @@ def _play(instance: Instance, seed: int, dimension: ActionNumber, value: float, 
     before: dict[str, Numbers] = {}
     for moment in EpisodePlayer(instance, seed, sequence=sequence, max_steps=len(sequence)):
         if moment.step == ARM_STEPS:
-            before = find_objects(instance.env, instance.find_clients())
+            before = _read_objects(instance)
         if moment.step == len(sequence):
             paid = dict(find_numbers(moment.info)).get(name)
-    after = find_objects(instance.env, instance.find_clients())
+    after = _read_objects(instance)
     is_moved = any(np.abs(after[body] - place).max() > MOVED for body, place in before.items() if body in after)
     return None if is_moved else paid
+
+
+def _read_objects(instance: Instance) -> dict[str, Numbers]:
+    objects = find_objects(instance.env, instance.find_clients())
+    return {name: one.read() for name, one in objects.items()}
 
 
 def _list_actions(trials: Trials, seed: int, dimension: ActionNumber, value: float) -> list[Any]:

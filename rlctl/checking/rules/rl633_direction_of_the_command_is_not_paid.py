@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rlctl.checking.drawn_goals import DrawnPlace, Numbers
 from rlctl.checking.experiments.commands import LATER_STEPS, CommandTrials, judges_commands
-from rlctl.checking.experiments.goals import DrawnPlace, Numbers
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 

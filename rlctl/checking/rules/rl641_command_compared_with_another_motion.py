@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rlctl.checking.command_sweeps import Array, CommandSweep
+from rlctl.checking.drawn_goals import DrawnPlace
 from rlctl.checking.experiments.commands import MOTION_WORDS, CommandTrials, judges_commands
-from rlctl.checking.experiments.goals import DrawnPlace
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.term_names import split_name

@@ -1,0 +1,26 @@
+"""RL605, RL622, RL626, RL627: what plays that reach the goal pay, where the reward is one number."""
+
+import pytest
+
+from tests.checking.judging import case, check_case, mark_slow
+
+
+def broken(name, twin, file="broken_reaching.py", **settings):
+    return case(f"{file}:{name}", (name[:5], "warning"), twin=f"{file}:{twin}", **settings)
+
+
+CASES = [
+    broken("RL605SailboatPaidPerStep", "Sailboat", slow=True),
+    broken("RL627SailboatOldBuoy", "Sailboat", slow=True),
+    broken("RL605DiscOldDistance", "DiscWithBlock", slow=True),
+    broken("RL622DiscLeavesBlock", "DiscWithBlock", slow=True),
+    broken("RL622DiscOtherAxes", "DiscWithBlock", slow=True),
+    broken("RL622PointCopterAbove", "PointCopter", slow=True),
+    broken("RL626SledTwoFrames", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
+    broken("RL622SledLeavesCube", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
+]
+
+
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
