@@ -97,11 +97,11 @@ class RL811LegOrder(Leg):
     order = (1, 0)
 
 
-class RL840LegFeelsNothing(Leg):
+class RL834LegFeelsNothing(Leg):
     site = '<site name="foot" pos="0.06 0 -0.15" size="0.01"/>'
 
 
-class RL840LegSearches(Leg):
+class RL834LegSearches(Leg):
     """It has no sensor, and searches the contacts."""
 
     site = sensor = ""
@@ -113,6 +113,6 @@ class RL840LegSearches(Leg):
         return any(self.find_foot() in pair for pair in self.data.contact.geom.tolist())
 
 
-class RL840LegSearchesTheShin(RL840LegSearches):
+class RL834LegSearchesTheShin(RL834LegSearches):
     def find_foot(self):
         return self.model.geom("foot").id + 1

@@ -74,7 +74,7 @@ class Rover(gym.Env):
         return self.observe(), float(reward), False, self.steps >= 300, {}
 
 
-class RL640RoverRaces(Rover):
+class RL634RoverRaces(Rover):
     def pay_speed(self, missing):
         return np.exp(-missing / 0.5)
 
@@ -86,12 +86,12 @@ class RoverIsCapped(Rover):
         return -max(missing, 0.0)
 
 
-class RL641RoverTurnsAboutItsSide(Rover):
+class RL635RoverTurnsAboutItsSide(Rover):
     def rate(self):
         return self.data.qvel[4]
 
 
-class RL641RoverTurnsBack(Rover):
+class RL635RoverTurnsBack(Rover):
     def rate(self):
         return -self.data.qvel[5]
 
@@ -133,12 +133,12 @@ class Boat(gym.Env):
         return self.observe(), float(sum(terms.values())), False, self.steps >= 200, {"reward_terms": terms}
 
 
-class RL640BoatFleesTheCommand(Boat):
+class RL634BoatFleesTheCommand(Boat):
     def terms(self):
         return {**super().terms(), "turn": 0.5 * (self.command[1] - self.rate) ** 2}
 
 
-class RL641BoatTurnsBack(Boat):
+class RL635BoatTurnsBack(Boat):
     def terms(self):
         return {**super().terms(), "turn": -0.5 * (self.command[1] + self.rate) ** 2}
 

@@ -1,4 +1,4 @@
-"""RL129, RL650; further forms of RL115, RL119, RL815, RL820 and RL832: in sums, in lengths, or by the source only."""
+"""RL129, RL636; further forms of RL115, RL119, RL815, RL820 and RL832: in sums, in lengths, or by the source only."""
 
 import pytest
 
@@ -19,8 +19,8 @@ CASES = [
     broken("RL129PlatformInTheWorld", "Platform", slow=True),
     broken("RL115TugOldView", "Tug", slow=True),
     broken("RL119TugTiltsInDegrees", "TugThatTilts", slow=True),
-    broken("RL650TugPaidLate", "Tug", slow=True),
-    broken("RL650GlintPaidLate", "Glint", slow=True),
+    broken("RL636TugPaidLate", "Tug", slow=True),
+    broken("RL636GlintPaidLate", "Glint", slow=True),
     broken("RL832TugFast", "Tug", slow=True),
     broken("RL832GlintFast", "Glint", slow=True),
     broken("RL815TugOldWay", "Tug", slow=True),

@@ -18,8 +18,8 @@ def broken(name, *more, severity="warning", twin="Leg"):
 CASES = [
     broken("RL628LegLandsInEveryStep"),
     broken("RL811LegOrder", severity="error"),
-    broken("RL840LegFeelsNothing", CONSTANT),
-    broken("RL840LegSearchesTheShin", CONSTANT, twin="RL840LegSearches"),
+    broken("RL834LegFeelsNothing", CONSTANT),
+    broken("RL834LegSearchesTheShin", CONSTANT, twin="RL834LegSearches"),
 ]
 
 
@@ -30,7 +30,7 @@ def test_finds_the_mistake_and_only_that(case):
 
 @pytest.mark.slow
 def test_the_message_about_a_sensor_says_how_far_the_contacts_are():
-    (finding,) = findings(f"{FILE}:RL840LegFeelsNothing", "RL840")
+    (finding,) = findings(f"{FILE}:RL834LegFeelsNothing", "RL834")
     distance = float(re.search(r"the nearest contact is ([0-9.]+) m", finding.message)[1])
     # The foot is a ball of 0.02 m, and the site 0.06 m from its centre: no contact is nearer than 0.04 m, and one below
     # the foot while it stands upright is sqrt(0.06^2 + 0.02^2) = 0.063 m away.

@@ -1,4 +1,4 @@
-"""RL640 and RL641: which value of the command pays most, with the same motion."""
+"""RL634 and RL635: which value of the command pays most, with the same motion."""
 
 import pytest
 
@@ -13,11 +13,11 @@ def broken(name, twin, **settings):
 
 
 CASES = [
-    broken("RL640RoverRaces", "Rover", slow=True),
-    broken("RL640BoatFleesTheCommand", "Boat", slow=True),
-    broken("RL641RoverTurnsAboutItsSide", "Rover", slow=True),
-    broken("RL641RoverTurnsBack", "Rover", slow=True),
-    broken("RL641BoatTurnsBack", "Boat", slow=True),
+    broken("RL634RoverRaces", "Rover", slow=True),
+    broken("RL634BoatFleesTheCommand", "Boat", slow=True),
+    broken("RL635RoverTurnsAboutItsSide", "Rover", slow=True),
+    broken("RL635RoverTurnsBack", "Rover", slow=True),
+    broken("RL635BoatTurnsBack", "Boat", slow=True),
 ]
 
 
@@ -29,4 +29,4 @@ def test_finds_the_mistake_and_only_that(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("sound", ["RoverIsCapped", "BoatGoesAlong"])
 def test_a_reward_without_a_best_command_may_be_meant(sound):
-    assert found(f"{FILE}:{sound}", "RL640", "RL641") == set()
+    assert found(f"{FILE}:{sound}", "RL634", "RL635") == set()

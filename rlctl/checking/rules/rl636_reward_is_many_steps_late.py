@@ -1,4 +1,4 @@
-"""RL650: reward is many steps late."""
+"""RL636: reward is many steps late."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.values import flatten_action
 
 RULE = Rule(
-    "RL650",
+    "RL636",
     "reward is many steps late",
     Severity.WARNING,
     meaning="""

@@ -1,4 +1,4 @@
-"""RL640: more than the command pays more."""
+"""RL634: more than the command pays more."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
-    "RL640",
+    "RL634",
     "more than the command pays more",
     Severity.WARNING,
     meaning="""

@@ -1,4 +1,4 @@
-"""RL840: contact is never seen."""
+"""RL834: contact is never seen."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -18,7 +18,7 @@ from rlctl.checking.worlds import Array
 from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
-    "RL840",
+    "RL834",
     "contact is never seen",
     Severity.WARNING,
     meaning="""

@@ -1,4 +1,4 @@
-"""RL641: command compared with another motion."""
+"""RL635: command compared with another motion."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.term_names import split_name
 
 RULE = Rule(
-    "RL641",
+    "RL635",
     "command compared with another motion",
     Severity.WARNING,
     meaning="""
