@@ -5,6 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from rlctl.checking.action_trials import find_dimensions
+from rlctl.checking.episode import draw_actions
 from rlctl.environments.leaves import find_leaves
 from tests.checking.judging import case, check_case, findings, found, mark_slow, rules_of, verdict_of
 
@@ -90,3 +91,22 @@ def test_ends_of_whole_numbers_are_whole_numbers():
         assert dimension.ends == (bounds.min, bounds.max)
     (unbounded,) = find_dimensions(find_leaves(spaces.Box(-np.inf, 5.0, (), np.float32)))
     assert unbounded.ends == (-1.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Box(np.array([-2.0, 0.5], np.float32), np.array([3.0, 7.0], np.float32)),
+        spaces.Box(-1.0, 1.0, (2, 3), np.float64),
+        spaces.Box(-1.0, 1.0, ()),
+        spaces.Box(-np.inf, np.inf, (2,)),
+        spaces.Box(0, 255, (3,), np.uint8),
+        spaces.Dict({"grip": spaces.Discrete(3), "move": spaces.Box(-1.0, 1.0, (2,))}),
+    ],
+    ids=str,
+)
+def test_random_actions_are_the_samples_of_the_space(space):
+    drawn = draw_actions(space, "random", 5)
+    space.seed(5)
+    for _ in range(200):
+        np.testing.assert_equal(next(drawn), space.sample(), strict=isinstance(space, spaces.Box))
