@@ -43,6 +43,8 @@ class FlyerIsSent(Commanded, Flyer):
 
 
 class RL128FlyerIsSentNorth(FlyerIsSent):
+    rlctl_ignore = {**Flyer.rlctl_ignore, "RL701": "how high it flies is neither seen nor paid"}
+
     def seen(self):
         return self.data.qvel[:2]
 
@@ -100,5 +102,10 @@ class AirshipIsSent(Commanded, Airship):
 
 
 class RL128AirshipIsSentTwice(AirshipIsSent):
+    rlctl_ignore = {
+        **AirshipIsSent.rlctl_ignore,
+        **dict.fromkeys(["RL124", "RL129"], "without the command, the velocity alone shows it as well"),
+    }
+
     def seen_velocity(self):
         return self.turn(self.velocity, self.yaw)

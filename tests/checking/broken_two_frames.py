@@ -14,6 +14,11 @@ class AirshipInWorld(Airship):
 
 
 class RL127AirshipGoal(Airship):
+    rlctl_ignore = {
+        **Airship.rlctl_ignore,
+        "RL129": "turned with the world, the way to the goal alone shows it as well",
+    }
+
     def seen_goal(self):
         return self.turn(self.goal - self.place, self.yaw)
 
