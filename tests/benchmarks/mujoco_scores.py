@@ -172,7 +172,8 @@ def read_run(folder: Path, cores: int) -> list[Row]:
     status, recipe = run.status(), run.recipe()
     if status.get("status") != "finished":
         raise RuntimeError(f"{folder}: the training has not finished")
-    tool = f"rlctl {recipe.algo}" + ("" if fill_parameters(recipe).get("actor_average") else NOT_AVERAGED)
+    is_averaged = fill_parameters(recipe).get("actor_average", True)  # only some algorithms can be
+    tool = f"rlctl {recipe.algo}" + ("" if is_averaged else NOT_AVERAGED)
     shared = status["task"], tool, read_version("rlctl"), recipe.seed, recipe.total_timesteps
     curve = [(int(row["steps"]), float(row["return"]), float(row["seconds"]) / 60) for row in read_csv(run.evals_file)]
     shown = _describe_command(status, recipe)
