@@ -11,6 +11,8 @@ from robots import Crawler
 class HopperFeels(MujocoHopper):
     """It sees them beside the rest, without noise."""
 
+    soles = "left_sole", "right_sole", "back_sole"
+
 
 class RL835HopperFeelsTheLeftTwice(HopperFeels):
     soles = "left_sole", "left_sole", "back_sole"
