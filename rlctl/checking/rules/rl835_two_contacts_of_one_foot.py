@@ -1,5 +1,6 @@
 """RL835: two contacts of one foot."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -42,8 +43,9 @@ def _find_repeated_contacts(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         touches = np.concatenate([read_touches(log, links) for log in one.logs])
         names, parts = name_observed(watched.instance.env, one)
         active = {place: _read_active(values) for place, values in enumerate(one.observed.T) if np.ptp(values) > 0}
-        follows = {place: _correlate(values, touches) for place, values in active.items()}
-        for first, second in _find_pairs(active, names, parts):
+        pairs = list(_find_pairs(active, names, parts))
+        follows = {place: _correlate(values, touches) for place, values in active.items()} if pairs else {}
+        for first, second in pairs:
             if unseen := _find_unseen(follows[first], [follows[place] for place in follows], touches):
                 yield _describe(one, names, (first, second), (links[unseen[0]], links[unseen[1]]), touches[:, unseen])
                 return
@@ -71,13 +73,15 @@ def _find_pairs(
     active: dict[int, NDArray[np.bool_]], names: Sequence[str], parts: Sequence[str]
 ) -> Iterator[tuple[int, int]]:
     """Yield elements that are near each other, or whose arrays have nearly the same name, and always say the same."""
-    for first, values in active.items():
-        for second, others in active.items():
-            if first < second and np.array_equal(values, others) and values.any() and not values.all():
-                is_near = parts[first] == parts[second] and second - first <= NEAR
-                apart = {*split_name(parts[first])} ^ {*split_name(parts[second])}
-                if is_near or (parts[first] != parts[second] and len(apart) == 2):
-                    yield first, second
+    alike: dict[bytes, list[int]] = {}
+    for place, values in active.items():
+        if values.any() and not values.all():
+            alike.setdefault(values.tobytes(), []).append(place)
+    for first, second in (pair for places in alike.values() for pair in itertools.combinations(places, 2)):
+        is_near = parts[first] == parts[second] and second - first <= NEAR
+        apart = {*split_name(parts[first])} ^ {*split_name(parts[second])}
+        if is_near or (parts[first] != parts[second] and len(apart) == 2):
+            yield first, second
 
 
 def _find_unseen(follows: Array, every: Sequence[Array], touches: NDArray[np.bool_]) -> list[int]:
