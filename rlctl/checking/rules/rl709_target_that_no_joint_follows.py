@@ -28,7 +28,7 @@ RULE = Rule(
 STEPS = 16
 SEEDS = (FIRST_SEED, FIRST_SEED + 1)
 SAME, NEAR = 1e-5, 0.1  # of a target and its joint at reset, which float32 rounds; where joints begin with noise
-Played = list[tuple[Array, EngineState]]
+Looks = list[tuple[Array, EngineState]]
 
 
 @judges_sums(RULE)
@@ -63,7 +63,7 @@ def _find_unfollowed(found: FoundSums) -> Iterator[ChildMessage]:
             return
 
 
-def _play(found: FoundSums, seed: int, element: int | None = None) -> Played:
+def _play(found: FoundSums, seed: int, element: int | None = None) -> Looks:
     """Play random actions, all numbers or all but one of them; of this, the opposite ones."""
     instance = found.trials.instance
     size = sum(int(np.prod(leaf.shape)) for leaf in instance.action_leaves)
@@ -74,12 +74,12 @@ def _play(found: FoundSums, seed: int, element: int | None = None) -> Played:
     return found.trials.play_bodies(seed, actions)
 
 
-def _is_same(one: Played, two: Played) -> bool:
+def _is_same(one: Looks, two: Looks) -> bool:
     pairs = zip(one, two, strict=False)
     return len(one) == len(two) > 1 and all(np.array_equal(a[1].everything, b[1].everything) for a, b in pairs)
 
 
-def _find_joint(one: ActionSum, others: Sequence[ActionSum], plain: Sequence[Played]) -> str:
+def _find_joint(one: ActionSum, others: Sequence[ActionSum], plain: Sequence[Looks]) -> str:
     """Return the joint that begins where a target does, in all episodes, or near it, where no other target begins near
     that joint; empty if there is none. Not every number that adds up an action is a target of the engine."""
     starts = [played[0] for played in plain]
