@@ -1,7 +1,9 @@
 """Moves a number of a command over a wide range at moments of episodes, to see for which value a step pays most."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +11,11 @@ from numpy.typing import NDArray
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.drawn_goals import DrawnGoal, DrawnPlace
+from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.snapshots import Beginnings, Snapshot
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 
@@ -87,7 +91,7 @@ class CommandSweep:
 def sweep_command(instance: Instance, place: DrawnPlace) -> CommandSweep | None:
     """Sweep a number of a command; None where too few moments can be played, time runs out, or the environment does not
     take such commands."""
-    trials = GoalTrials(instance, DrawnGoal(place, (), (), {}, {}))
+    trials = GoalTrials(instance, DrawnGoal(place, (), (), {}, {}), begun=_SweptBeginnings())
     try:
         drawn = _draw(instance, place)
         moments = []
@@ -99,6 +103,18 @@ def sweep_command(instance: Instance, place: DrawnPlace) -> CommandSweep | None:
     except EnvironmentRaised:  # a table may end, or a number overflow
         return None
     return CommandSweep(drawn, moments) if len(moments) >= FEWEST else None
+
+
+class _SweptBeginnings(Beginnings):
+    """Keeps the state also where resets are fast: each moment is played for dozens of values, and the steps before it
+    take longer than a reset. PyBullet puts a state back with rounding errors, which may decide which value is best."""
+
+    def keep(self, episode: EpisodePlayer, key: Any, values: Mapping[str, Any]) -> None:
+        instance = episode.instance
+        if self._is_useful is None and not instance.find_clients():
+            with contextlib.suppress(LookupError):
+                self._is_useful = Snapshot(instance).is_faithful(episode)
+        super().keep(episode, key, values)
 
 
 def _draw(instance: Instance, place: DrawnPlace) -> Array:

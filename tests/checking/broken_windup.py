@@ -1,6 +1,9 @@
-"""Robots whose actions are added up to a command, next to their twins, which keep the command within its limits."""
+"""Robots whose actions are added up to a command, next to their twins, which keep the command within its limits and
+give all of it to the motors."""
 
+import mujoco
 import numpy as np
+import pybullet as p
 from broken_meaning import Robot
 from mujoco_robots import MujocoArm
 from robots import Arm
@@ -82,3 +85,67 @@ class BulletArmAddsUp(Arm):
 class RL708BulletArmRunsOn(BulletArmAddsUp):
     def keep(self, targets):
         return targets
+
+
+class RL709ArmForgetsTheWrist(ArmAddsUp):
+    def move(self, action):
+        self.data.ctrl[self.motors[:2]] = self.targets(action)[:2]
+        mujoco.mj_step(self.model, self.data, nstep=self.frames)
+        self.forward()
+
+
+class BulletArmShowsTargets(BulletArmAddsUp):
+    """It shows them instead, and its targets begin where the joints are."""
+
+    last = 3
+
+    def size(self):
+        return super().size() + 3
+
+    def drive(self, targets):
+        self.kept = self.kept if self.has_begun else targets.copy()
+        for joint in range(self.last):
+            p.setJointMotorControl2(
+                self.robot, joint, p.POSITION_CONTROL, targets[joint], force=30.0, physicsClientId=self.client
+            )
+
+    def start(self):
+        self.has_begun = False
+        super().start()
+        self.has_begun = True
+
+    def observe(self):
+        return np.concatenate([super().observe(), self.kept]).astype(np.float32)
+
+
+class RL709BulletArmForgetsTheLast(BulletArmShowsTargets):
+    last = 2
+
+
+class ArmWithGripper(ArmAddsUp):
+    """A fourth number opens a gripper that no joint has, and that only weighs on the reward."""
+
+    joints = 4
+    opening = 0.04
+
+    def start(self):
+        super().start()
+        self.opening = 0.04
+
+    def move(self, action):
+        self.opening = float(np.clip(self.opening + 0.005 * action[3], 0.0, 0.08))
+        super().move(action[:3])
+
+    def observe(self):
+        return np.concatenate([super().observe(), [self.opening]])
+
+    def reward(self):
+        return super().reward() - self.opening
+
+
+class RL709GripperArmForgetsTheShoulder(ArmWithGripper):
+    def move(self, action):
+        self.opening = float(np.clip(self.opening + 0.005 * action[3], 0.0, 0.08))
+        self.data.ctrl[self.motors[1:]] = self.targets(action[:3])[1:]
+        mujoco.mj_step(self.model, self.data, nstep=self.frames)
+        self.forward()

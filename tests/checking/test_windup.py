@@ -1,4 +1,4 @@
-"""RL708: a command that adds up the actions, without an end."""
+"""RL708, RL709: a command that adds up the actions, without an end, or for no joint."""
 
 import pytest
 
@@ -9,13 +9,16 @@ FILE = "broken_windup.py"
 
 
 def broken(name, twin, **settings):
-    return case(f"{FILE}:{name}", ("RL708", "warning"), twin=f"{FILE}:{twin}", pybullet=True, **settings)
+    return case(f"{FILE}:{name}", (name[:5], "warning"), twin=f"{FILE}:{twin}", pybullet=True, **settings)
 
 
 CASES = [
     broken("RL708GateRunsOn", "Gate"),
     broken("RL708ArmRunsOn", "ArmAddsUp", slow=True),
     broken("RL708BulletArmRunsOn", "BulletArmAddsUp", slow=True),
+    broken("RL709ArmForgetsTheWrist", "ArmAddsUp"),
+    broken("RL709BulletArmForgetsTheLast", "BulletArmShowsTargets", slow=True),
+    broken("RL709GripperArmForgetsTheShoulder", "ArmWithGripper", slow=True),
 ]
 
 

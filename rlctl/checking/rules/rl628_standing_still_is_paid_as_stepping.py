@@ -39,7 +39,7 @@ SLOW = 0.05  # speeds that are as good as none [rad/s], [m/s]
 MUCH = 0.2  # part of what the term pays at most
 MOST_PAID = 0.95  # quantile of what it pays
 FEWEST_STAYS, FEWEST_LANDINGS = 30, 6  # steps
-ALIKE = 0.9  # part of the steps in which feet stay, in which each pays the same
+ALIKE, ALIKE_FLIGHTS = 0.75, 0.9  # parts of the steps in which feet stay, or none touches, that pay each the same
 EXACT = 1e-6  # relative error of what is paid
 FEWEST_VALUES = 3  # different ones, of what landings pay
 
@@ -122,10 +122,11 @@ def _find_paid_each(values: Numbers, before: NDArray[np.bool_], after: NDArray[n
     stays, flies = is_same & (count > 0), is_same & (count == 0)
     if stays.sum() < FEWEST_STAYS or lands.sum() < FEWEST_LANDINGS:
         return None
+    # Feet that bounce touch in one substep and not in the next, so that some steps pay landings that are not seen.
     each = float(np.median(values[stays] / count[stays]))
     rest = values - each * count
     is_alike = np.abs(rest) <= EXACT * max(1.0, abs(each))
     others = np.unique(np.round(rest[lands & ~is_alike], 6))
     if each == 0.0 or is_alike[stays].mean() < ALIKE or len(others) < FEWEST_VALUES:
         return None
-    return each if not flies.any() or is_alike[flies].mean() >= ALIKE else None
+    return each if not flies.any() or is_alike[flies].mean() >= ALIKE_FLIGHTS else None
