@@ -1,7 +1,7 @@
-"""Which elements are a direction that is fixed in the world, seen from a body that turns: the sun, a beacon, the north.
+"""Which elements are a direction that is fixed in the world, as that to the sun, turned the wrong way.
 
-R.T @ s moves as a fixed direction seen from the body does; R @ s, the wrong way, is fixed in no frame but one that turns
-twice as far.
+R.T @ s is how a body sees a direction s. R @ s moves as what is fixed to the body does, seen from the world; but an
+axis of the body is the same one in each episode.
 """
 
 import itertools
@@ -19,7 +19,7 @@ PARTS, SHORTEST = 3, 9  # into which an episode is divided, against noise; steps
 SAME_LENGTH = 0.05  # standard deviation of the length of a direction, relative
 DRAWN = 0.5  # root mean square by which directions of episodes differ from their mean, relative to their length
 FIXED, CLEARLY = 0.03, 4.0
-"""How far a direction may be from its episode's mean, relative to its length; how many times more in any other frame."""
+"""How far a direction may be from its episode's mean, relative to its length; how many times further in others."""
 MOST_BLOCKS = 60
 SAME_RATE = 0.98  # correlation of a turn and of an angular velocity
 LEAST_ANGLE = 1e-4  # root mean square of the turns in a step [rad]

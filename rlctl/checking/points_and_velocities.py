@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.step_times import find_rates
 from rlctl.checking.worlds import Array

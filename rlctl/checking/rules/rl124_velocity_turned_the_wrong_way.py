@@ -27,10 +27,10 @@ RULE = Rule(
         Three elements of the observation are the velocity of a free body, turned by its orientation in the wrong
         direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both
         velocities of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its
-        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity, and with a direction that
-        reset draws, as that to the sun, which does not move as a fixed one seen from the body does then. A robot without an
+        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction
+        that reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an
         engine is read from its attributes: its velocity is what changes its position, its frame the one in which its
-        actions push it.
+        actions push it, or the orientation that its angular velocity turns.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
@@ -89,8 +89,8 @@ def _find_directions(observed: Array, episodes: NDArray[np.int_], turns: Sequenc
     """Yield the first direction that is fixed in the world, turned the wrong way."""
     for column, turn in find_turned_directions(observed, episodes, turns):
         name = f"observation[{column}:{column + 3}]"
-        message = f"{name} is a direction that reset draws, turned by {turn.name} the wrong way: it is fixed only in a"
-        yield RuleFinding(RULE, f"{message} frame that turns against the body", {"element": name, "value": turn.name})
+        message = f"{name} is a direction that reset draws, turned by {turn.name} the wrong way: it moves as what is"
+        yield RuleFinding(RULE, f"{message} fixed to the body, not to the world", {"element": name, "value": turn.name})
         return
 
 

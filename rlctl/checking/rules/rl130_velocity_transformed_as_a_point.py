@@ -69,10 +69,10 @@ def _read_world(one: ObservedWorld) -> tuple[list[Place], list[Velocity]]:
         matrices = attitudes.compute_matrices(rows[:, TURN])
         arms = rows[:, FRAME] - rows[:, CENTRE]
         at_frame = rows[:, LINEAR] + np.cross(rows[:, TURNING], arms)
-        places.append(Place(name, rows[:, FRAME], matrices))
+        places.append(Place(f"the position of {name}", rows[:, FRAME], matrices))
         velocities += [Velocity(f"the velocity of {name}", at_frame)]
         if np.abs(arms).max(initial=0.0) > SAME:
-            places.append(Place(name, rows[:, CENTRE], matrices))
+            places.append(Place(f"the position of {name}", rows[:, CENTRE], matrices))
             velocities += [Velocity(f"the velocity of {name}", rows[:, LINEAR])]
         velocities += [Velocity(f"the angular velocity of {name}", rows[:, TURNING])]
     return places, [one for one in velocities if np.sqrt(np.square(one.vectors).mean()) > MOVING]
@@ -133,5 +133,5 @@ def _measure_rests(blocks: Array, values: Array) -> Array:
 
 def _describe(names: Sequence[str], part: slice, velocity: Velocity, place: Place) -> RuleFinding:
     name = name_part(names[part])
-    message = f"{name} is {velocity.name} minus the position of {place.name}: it is not 0 where nothing moves"
+    message = f"{name} are {velocity.name} minus {place.name}: they are not 0 where nothing moves"
     return RuleFinding(RULE, message, {"element": name, "value": velocity.name})
