@@ -10,7 +10,7 @@ from rlctl.checking.worlds import Array
 MOST_TURNS, MOST_PLACES = 8, 8
 
 
-class Place(NamedTuple):
+class LoggedPlace(NamedTuple):
     """The position of something in all looks."""
 
     name: str
@@ -18,14 +18,16 @@ class Place(NamedTuple):
     matrices: Array | None  # From its frame to the world's, shape (looks, 3, 3), where it has one
 
 
-class Velocity(NamedTuple):
+class LoggedVelocity(NamedTuple):
     """The velocity of something in all looks."""
 
     name: str
     vectors: Array  # In the world. Shape (looks, 2 or 3)
 
 
-def list_places_of(log: AttributeLog, size: int, matrices: Sequence[Array]) -> tuple[list[Place], list[Velocity]]:
+def list_places_of(
+    log: AttributeLog, size: int, matrices: Sequence[Array]
+) -> tuple[list[LoggedPlace], list[LoggedVelocity]]:
     """Return the places and velocities that attributes of a robot without an engine are: consecutive numbers that
     change by other consecutive ones; each place alone and with each of the given orientations. `size` is 2 or 3."""
     rates = {place: rate for place, rate, _ in find_rates(log, log.values)}
@@ -36,6 +38,6 @@ def list_places_of(log: AttributeLog, size: int, matrices: Sequence[Array]) -> t
             continue
         name, rate = (log.names[i].rpartition("[")[0] or log.names[i] for i in (first, columns[0]))
         points = log.values[:, first : first + size]
-        places += [Place(name, points, turn) for turn in [None, *matrices[:MOST_TURNS]]]
-        velocities.append(Velocity(rate, log.values[:, columns]))
+        places += [LoggedPlace(name, points, turn) for turn in [None, *matrices[:MOST_TURNS]]]
+        velocities.append(LoggedVelocity(rate, log.values[:, columns]))
     return places, velocities

@@ -10,7 +10,7 @@ from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
-from rlctl.checking.points_and_velocities import Place, Velocity, list_places_of
+from rlctl.checking.points_and_velocities import LoggedPlace, LoggedVelocity, list_places_of
 from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -60,7 +60,7 @@ def _judge_records(records: Records) -> Iterator[RuleFinding]:
             return
 
 
-def _read_world(one: ObservedWorld) -> tuple[list[Place], list[Velocity]]:
+def _read_world(one: ObservedWorld) -> tuple[list[LoggedPlace], list[LoggedVelocity]]:
     """Return the places of all links with their rotations, and their velocities."""
     points = np.array([rows for log in one.logs for rows in log.points])
     places, velocities = [], []
@@ -69,18 +69,18 @@ def _read_world(one: ObservedWorld) -> tuple[list[Place], list[Velocity]]:
         matrices = attitudes.compute_matrices(rows[:, TURN])
         arms = rows[:, FRAME] - rows[:, CENTRE]
         at_frame = rows[:, LINEAR] + np.cross(rows[:, TURNING], arms)
-        places.append(Place(f"the position of {name}", rows[:, FRAME], matrices))
-        velocities += [Velocity(f"the velocity of {name}", at_frame)]
+        places.append(LoggedPlace(f"the position of {name}", rows[:, FRAME], matrices))
+        velocities += [LoggedVelocity(f"the velocity of {name}", at_frame)]
         if np.abs(arms).max(initial=0.0) > SAME:
-            places.append(Place(f"the position of {name}", rows[:, CENTRE], matrices))
-            velocities += [Velocity(f"the velocity of {name}", rows[:, LINEAR])]
-        velocities += [Velocity(f"the angular velocity of {name}", rows[:, TURNING])]
+            places.append(LoggedPlace(f"the position of {name}", rows[:, CENTRE], matrices))
+            velocities += [LoggedVelocity(f"the velocity of {name}", rows[:, LINEAR])]
+        velocities += [LoggedVelocity(f"the angular velocity of {name}", rows[:, TURNING])]
     return places, [one for one in velocities if np.sqrt(np.square(one.vectors).mean()) > MOVING]
 
 
 def _find_point(
-    observed: Array, places: Sequence[Place], velocities: Sequence[Velocity], sizes: Sequence[int]
-) -> tuple[slice, Velocity, Place] | None:
+    observed: Array, places: Sequence[LoggedPlace], velocities: Sequence[LoggedVelocity], sizes: Sequence[int]
+) -> tuple[slice, LoggedVelocity, LoggedPlace] | None:
     for size in sizes:
         columns = range(min(MOST_ELEMENTS, observed.shape[1] - size + 1))
         if not columns or not velocities:
@@ -96,7 +96,7 @@ def _find_point(
     return None
 
 
-def _list_rotations(place: Place, size: int) -> list[Array]:
+def _list_rotations(place: LoggedPlace, size: int) -> list[Array]:
     same = np.tile(np.eye(size), (len(place.points), 1, 1))
     if place.matrices is None:
         return [same]
@@ -131,7 +131,7 @@ def _measure_rests(blocks: Array, values: Array) -> Array:
     return np.asarray(np.square(blocks).sum(axis=1) - np.square(blocks @ values) / size)
 
 
-def _describe(names: Sequence[str], part: slice, velocity: Velocity, place: Place) -> RuleFinding:
+def _describe(names: Sequence[str], part: slice, velocity: LoggedVelocity, place: LoggedPlace) -> RuleFinding:
     name = name_part(names[part])
     message = f"{name} are {velocity.name} minus {place.name}: they are not 0 where nothing moves"
     return RuleFinding(RULE, message, {"element": name, "value": velocity.name})
