@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -119,7 +120,8 @@ def _list_times(log: AttributeLog, words: set[str]) -> dict[str, float]:
 
 
 def words_of(name: str) -> list[str]:
-    """Return the words of the last part of a name: of `self.cfg['gait_period']` these are `gait` and `period`."""
+    """Return the words of the last part of a name: of `self.cfg['gait_period'][0]` these are `gait` and `period`."""
+    name = re.sub(r"(\[\d+\])+$", "", name)
     last = name.rpartition(".")[2].rpartition("[")[2] or name
     return split_name(last)
 

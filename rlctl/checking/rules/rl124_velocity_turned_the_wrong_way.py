@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
 from rlctl.checking.body_frames import BodyFrame, find_body_frames
@@ -11,9 +12,11 @@ from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
+from rlctl.checking.fixed_directions import find_turned_directions, list_body_turns
 from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.shared_frames import Turn, list_world_turns
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
 RULE = Rule(
@@ -24,9 +27,10 @@ RULE = Rule(
         Three elements of the observation are the velocity of a free body, turned by its orientation in the wrong
         direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both
         velocities of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its
-        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity. A robot without an
+        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction
+        that reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an
         engine is read from its attributes: its velocity is what changes its position, its frame the one in which its
-        actions push it.
+        actions push it, or the orientation that its angular velocity turns.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
@@ -53,8 +57,14 @@ class _Vectors:
 @judges_worlds(RULE)
 def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for one in watched.observed:
-        for vectors in [*_list_velocities(one), *_list_gravities(one)]:
-            yield from _find_in_observation(one.observed, vectors)
+        found = [
+            finding
+            for vectors in [*_list_velocities(one), *_list_gravities(one)]
+            for finding in _find_in_observation(one.observed, vectors)
+        ]
+        sizes = [len(log.observed) for log in one.logs]
+        episodes = np.repeat(np.arange(len(sizes)), sizes)
+        yield from found or _find_directions(one.observed, episodes, list_world_turns(one))
 
 
 @judges_records(RULE, "worlds", "attributes")
@@ -72,6 +82,16 @@ def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:
             for finding in _find_in_observation(log.observed, vectors):
                 yield finding
                 return
+    yield from _find_directions(log.observed, log.episodes, list_body_turns(log))
+
+
+def _find_directions(observed: Array, episodes: NDArray[np.int_], turns: Sequence[Turn]) -> Iterator[RuleFinding]:
+    """Yield the first direction that is fixed in the world, turned the wrong way."""
+    for column, turn in find_turned_directions(observed, episodes, turns):
+        name = f"observation[{column}:{column + 3}]"
+        message = f"{name} is a direction that reset draws, turned by {turn.name} the wrong way: it moves as what is"
+        yield RuleFinding(RULE, f"{message} fixed to the body, not to the world", {"element": name, "value": turn.name})
+        return
 
 
 def _list_vectors(frame: BodyFrame) -> Iterator[_Vectors]:

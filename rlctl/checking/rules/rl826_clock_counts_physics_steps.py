@@ -42,6 +42,20 @@ STOPS = 0.4  # part of the steps in which a clock may stand at its end
 PERIOD_WORDS = {"period", "cycle", "gait"}
 FREQUENCY_WORDS = {"freq", "frequency", "hz", "cadence"}
 TIME_WORDS = {"t", "time", "clock", "seconds", "elapsed", "remaining", "timer"}
+TIMER_WORDS = TIME_WORDS | {
+    "air",
+    "stance",
+    "swing",
+    "contact",
+    "cooldown",
+    "wait",
+    "dwell",
+    "hold",
+    "held",
+    "still",
+    "stuck",
+}
+FEWEST_ADVANCES = 8  # of a timer that often begins again
 LIMIT_WORDS = {"max", "limit", "episode", "horizon", "length", "duration"}
 SECOND_WORDS = {"s", "sec", "secs", "seconds", "time", "duration"}
 STEP_WORDS = {"steps"}
@@ -57,6 +71,7 @@ class _Clock:
     advance: float  # in a step; below 0 where it shows what is left
     is_angle: bool  # of a cosine and a sine
     is_observed: bool
+    is_timer: bool = False  # it begins again within an episode, and may stand
 
     @property
     def verb(self) -> str:
@@ -119,6 +134,12 @@ def _find_clocks(records: Records, log: AttributeLog) -> Iterator[_Clock]:
         for column, name in enumerate(named):
             if (advance := _find_advance(changes[:, column])) is not None:
                 yield _Clock(name, advance, False, is_observed)
+    for rows, named, is_observed in ((log.values, log.names, False), (log.observed, names, True)):
+        changes, after = log.changes(rows), rows[log.is_step]
+        for column, name in enumerate(named):
+            advance = _find_timer(changes[:, column], after[:, column])
+            if advance is not None and (is_observed or set(words_of(name)) & TIMER_WORDS):
+                yield _Clock(name, advance, False, is_observed, is_timer=True)
 
 
 def _find_advance(changes: Array) -> float | None:
@@ -129,6 +150,24 @@ def _find_advance(changes: Array) -> float | None:
     is_stop = (forwards >= 0) & (forwards < abs(advance))  # at its end, which it may reach within a step
     is_clock = advance != 0 and bool((is_usual | is_wrap | is_stop).all())
     return advance if is_clock and is_wrap.mean() < WRAPS and (~is_usual & is_stop).mean() < STOPS else None
+
+
+def _find_timer(changes: Array, after: Array) -> float | None:
+    """Return the advance of what counts the time of something that comes and goes, in the air say: it rises by always
+    the same from 0, or falls by it to 0."""
+    for sign in (1.0, -1.0):
+        forwards = sign * changes
+        is_last = (after == 0) if sign < 0 else np.zeros(len(after), bool)
+        steps = forwards[(forwards > 0) & ~is_last]
+        if len(steps) < FEWEST_ADVANCES:
+            continue
+        advance = float(np.median(steps))
+        begins = forwards < 0
+        is_start = np.isclose(after, 0.0) | np.isclose(after, advance) if sign > 0 else after > 0
+        is_short = bool((np.abs(steps - advance) <= EXACT * advance).all() and (after >= 0).all())
+        if is_short and begins.any() and is_start[begins].all():
+            return sign * advance
+    return None
 
 
 def _find_sine(log: AttributeLog, values: Array) -> float | None:
@@ -146,6 +185,12 @@ def _find_sine(log: AttributeLog, values: Array) -> float | None:
 def _judge_clock(
     clock: _Clock, declared: Mapping[str, float], times: StepTimes, limit: int | None
 ) -> Iterator[RuleFinding]:
+    advance = abs(clock.advance)
+    if clock.is_timer:
+        if wrong := _name_wrong(advance, times):
+            message = f"{clock.name} {clock.verb} by {advance:.4g} in a step that takes {times.control_s:.4g} s"
+            yield _finding(clock.name, f"{message}: {wrong}", advance, times.control_s)
+        return
     for name, period in _list_periods(declared):
         for whole in (FULL_TURN,) if clock.is_angle else (1.0, FULL_TURN):
             if _is_turn(clock.advance, times.control_s / period, whole):
@@ -156,7 +201,6 @@ def _judge_clock(
                     message = f"{clock.name} takes {shown_s:.4g} s for a whole turn, and {name} says {period:.4g} s"
                     yield _finding(clock.name, f"{message}: {_name_wrong(seconds, times)}", shown_s, period)
                     return
-    advance = abs(clock.advance)
     is_part = limit is not None and math.isclose(advance * limit, 1.0, rel_tol=2 / limit)
     if clock.is_angle or is_part:
         return
