@@ -26,6 +26,7 @@ class DrawnPlace:
     name: str  # of the attribute
     elements: tuple[int, ...]
     later: tuple[tuple[int, ...], ...] = ()  # The elements of the goals after it, where there are several
+    is_part: bool = False  # whether it is one of several drawn elements
 
     @property
     def size(self) -> int:
@@ -81,7 +82,7 @@ class DrawnGoal:
 
     def name_axis(self, axis: int) -> str:
         """Name an element of the place: `self.goal[1]`."""
-        is_number = self.place.elements == (0,)
+        is_number = self.place.elements == (0,) and not self.place.is_part
         return self.name if is_number else f"{self.name}[{self.place.elements[axis]}]"
 
 

@@ -132,6 +132,11 @@ class GoalTrials:
                 return True
         return False
 
+    def is_success_after(self, seed: int, source: Source, steps: int) -> bool:
+        """Say whether the step after so many is a success with the goal at a place of the observation."""
+        episode = GoalEpisode(self, seed, "repeated", steps)
+        return not episode.has_ended and bool(episode.step(episode.read(source)).succeeds)
+
     def find_place(self, source: Source, seed: int, actions: str = "repeated") -> Numbers | None:
         """Return what is a place by a source, after a few steps, by default with the action that the seed draws; None
         if the episode ends or succeeds before."""

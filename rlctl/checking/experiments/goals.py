@@ -21,6 +21,7 @@ from rlctl.checking.workspaces import Reach, find_chains, measure_reach
 
 SIZES = (1, 2, 3)  # of a place [numbers]
 MOST_CANDIDATES = 6
+MOST_PARTS = 3  # elements of a goal, each of which may be one by itself, such as the angle of a door
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
 PART = 5e-7  # of observations, that float32 rounds
@@ -140,12 +141,14 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
             of_rows = [tuple(row * rows[1] + column for column in columns) for row in range(rows[0])]
             return [DrawnPlace(one.name, of_rows[0], tuple(of_rows[1:]))]
         return []
+    parts = [DrawnPlace(one.name, (element,), is_part=True) for element in drawn[:MOST_PARTS] if size > 1]
+    parts = parts if is_about_goals(one.name) else []
     if len(drawn) not in SIZES or len(drawn) < min(2, size):
-        return []
+        return parts
     found = [DrawnPlace(one.name, tuple(range(size)))] if size in SIZES else []
     if len(drawn) < size:
         found.append(DrawnPlace(one.name, drawn))
-    return found
+    return [*found, *parts]
 
 
 def find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
@@ -198,6 +201,8 @@ def _observe(instance: Instance, place: DrawnPlace, shift: float, along: Numbers
 
 def _find_reaches(instance: Instance, place: DrawnPlace, copies: Sequence[Source]) -> dict[Source, Reach]:
     """Return how far the links of fixed robots get whose places are observed, by where they are observed."""
+    if place.is_part:  # a single number says too little of a place
+        return {}
     rows, goals, links = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + COMPARED):
         first = EpisodePlayer(instance, seed, max_steps=0).reset()
