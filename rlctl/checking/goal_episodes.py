@@ -193,7 +193,7 @@ class GoalEpisode:
         moment = self._player.reset()
         self._attribute = self._place.find(self._instance.env)
         self.goal = self._place.pick(self._attribute)
-        self.observed = flatten_floats(self._instance.leaves, moment.observation)  # Shape (elements,)
+        self.observed = self._flatten(moment)  # Shape (elements,)
         self.play([None] * first)
         if not self.has_ended:
             trials.begun.keep(self._player, (seed, actions, first), vars(self))
@@ -211,6 +211,9 @@ class GoalEpisode:
         self._player.resume(first)
         return True
 
+    def _flatten(self, moment: Moment) -> Numbers:
+        return self._trials.drawn.extend(flatten_floats(self._instance.leaves, moment.observation))
+
     @property
     def has_ended(self) -> bool:
         """Whether there is no other step."""
@@ -223,7 +226,7 @@ class GoalEpisode:
             self.goal = goal
         self._goals.append(goal)
         moment = self._player.step()
-        self.observed = flatten_floats(self._instance.leaves, moment.observation)
+        self.observed = self._flatten(moment)
         succeeds = _read_success(moment)
         self.has_succeeded |= bool(succeeds)
         return GoalStep(moment.reward_number, succeeds)
@@ -258,11 +261,23 @@ class GoalEpisode:
 
     def _read_turned(self, source: Source) -> Numbers:
         key = source, self._seed, self._actions, len(self._goals)
+        if key not in self._trials.turned_places and self.has_moved_on:
+            self._read_beside(source)  # this observation has the way to another goal already
         if key not in self._trials.turned_places:
             part = read_part(source, self.observed[None], self.goal.size)[0]
             way, *_ = np.linalg.lstsq(self.read_turn(source[0]), part, rcond=None)
             self._trials.turned_places[key] = self.goal - way
         return self._trials.turned_places[key]
+
+    def _read_beside(self, source: Source) -> None:
+        """Read a place in the same steps with the goal that was drawn; leave the environment as this episode did."""
+        first = min(self._first, len(self._goals))
+        other = GoalEpisode(self._trials, self._seed, self._actions, first, together=self._together)
+        other.play([None] * (len(self._goals) - first))
+        if not other.has_moved_on:
+            other.read(source)
+        again = GoalEpisode(self._trials, self._seed, self._actions, first, together=self._together)
+        again.play(self._goals[first:])
 
     def read_turn(self, element: int) -> Numbers:
         """Return how the observation turns the way to the goal, after a step. Shape (size, size). The same steps are

@@ -89,7 +89,7 @@ class RL638PointerPaidForTheFirst(FirstIsPaid, Pointer): ...
 class ArmPhases(Phases, MujocoArm):
     """Two attributes for two places. MuJoCo."""
 
-    rlctl_ignore = {"RL609": "it never ends"}
+    rlctl_ignore = {"RL611": "it never ends"}
 
     def start(self):
         super().start()
@@ -127,6 +127,8 @@ class RL637BoatCountsFromTheStart(FromTheStart, BoatSeeks): ...
 
 
 class ReacherSeeks(Reacher):
+    rlctl_ignore = {"RL605": "a consequence", "RL611": "chance does not get there"}
+
     def start(self):
         super().start()
         self.previous_distance = self.distance()
@@ -147,7 +149,7 @@ class RL637ReacherCountsFromTheStart(ReacherSeeks):
 class Door(Robot):
     """A motor opens a door, once its hand is at it, to the first angle; the second one comes later."""
 
-    rlctl_ignore = {"RL611": "chance does not stay there"}
+    rlctl_ignore = {"RL611": "chance does not stay there", "RL701": "the hand has to be at the door"}
 
     def start(self):
         self.hand, self.angle = 0.0, 0.0
@@ -185,3 +187,63 @@ class RL622DoorWithoutASize(Door):
 
     def distance(self):
         return abs(self.error())
+
+
+class TwoHands(Robot):
+    """Two hands push a block to poses, one after the other; the block sees the way to the pose, and the hands."""
+
+    rlctl_ignore = {"RL611": "chance does not get there"}
+    numbers, refreshes, sign = 4, True, 1.0
+
+    def start(self):
+        self.block = np.append(self.np_random.uniform(-0.1, 0.1, 2), self.np_random.uniform(-0.3, 0.3))
+        self.left, self.right = (self.np_random.uniform(-0.5, 0.5, 2) for _ in range(2))
+        self.reached = 0
+        self.draw()
+        self.before, self.progress = self.cost(), 0.0
+
+    def draw(self):
+        self.goal = self.np_random.uniform([-0.4, -0.4, -0.6], [0.4, 0.4, 0.6])
+
+    def turned(self, vector):
+        cosine, sine = np.cos(self.block[2]), np.sin(self.block[2])
+        return np.array([cosine * vector[0] + sine * vector[1], cosine * vector[1] - sine * vector[0]])
+
+    def distance(self):
+        return float(np.linalg.norm(self.goal[:2] - self.block[:2]))
+
+    def cost(self):
+        return 4.0 * self.distance() + abs(self.goal[2] - self.block[2])
+
+    def observe(self):
+        ways = [self.turned(one[:2] - self.block[:2]) for one in (self.left, self.right, self.goal)]
+        angle = self.goal[2] - self.block[2]
+        return np.array([*np.concatenate(ways), np.cos(angle), np.sin(angle)], np.float32)
+
+    def move(self, action):
+        self.left = np.clip(self.left + 0.04 * action[:2], -0.6, 0.6)
+        self.right = np.clip(self.right + 0.04 * action[2:], -0.6, 0.6)
+        for hand, turn in ((self.left, 0.02), (self.right, -0.02)):
+            if np.linalg.norm(hand - self.block[:2]) < 0.08:
+                self.block = self.block + np.append(0.2 * (self.block[:2] - hand), turn)
+        self.progress, self.before = self.before - self.cost(), self.cost()
+        if self.distance() < 0.03 and abs(self.goal[2] - self.block[2]) < 0.1:
+            self.reached += 1
+            self.draw()
+            self.before = self.cost() if self.refreshes else self.before
+
+    def reward(self, action):
+        gaps = [np.linalg.norm(hand - self.block[:2]) for hand in (self.left, self.right)]
+        near = sum(np.exp(-gap / 0.5) for gap in gaps)
+        return 2.0 * self.progress + 0.1 * self.sign * near - 0.01 * np.square(action).sum()
+
+    def result(self, reward, _):
+        return self.observe(), float(reward), False, self.steps >= self.limit, {"is_success": self.reached > 0}
+
+
+class RL627TwoHandsOldGoal(TwoHands):
+    refreshes = False
+
+
+class RL622TwoHandsStayAway(TwoHands):
+    sign = -1.0

@@ -24,6 +24,8 @@ CASES = [
     broken("RL637FlyerCountsFromTheStart", "FlyerSeeks", PHASES, pybullet=True, slow=True),
     broken("RL637BoatCountsFromTheStart", "BoatSeeks", PHASES, pybullet=True, slow=True),
     broken("RL637ReacherCountsFromTheStart", "ReacherSeeks", PHASES, pybullet=True, slow=True),
+    broken("RL627TwoHandsOldGoal", "TwoHands", PHASES, pybullet=True, slow=True),
+    broken("RL622TwoHandsStayAway", "TwoHands", PHASES, pybullet=True, slow=True),
     broken("RL622DoorWithoutASize", "Door", PHASES, pybullet=True, slow=True),
     broken("RL622SledLeavesCube", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
 ]

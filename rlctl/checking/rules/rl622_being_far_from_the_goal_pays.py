@@ -141,7 +141,8 @@ def _describe_peak(trials: GoalTrials, peaks: Sequence[Peak]) -> RuleFinding:
 
 
 def _describe_leaving(trials: GoalTrials, leaving: Leaving) -> RuleFinding:
-    what = "goes away" if leaving.is_change else "is"
+    verbs = ("go away", "are") if " and " in leaving.point else ("goes away", "is")
+    what = verbs[0] if leaving.is_change else verbs[1]
     message = f"the reward rises by {leaving.slope:.3g} for each unit that {leaving.point} {what} from {leaving.item},"
     message += f" which has to be brought to {trials.drawn.name} ({leaving.steps} steps in which it rests)"
     return RuleFinding(RULE, message, {"element": trials.drawn.name, "value": leaving.slope, "expected": "below 0"})
