@@ -110,7 +110,9 @@ class GoalTrials:
         """Return where it may have the place of something else, in a frame in which it has the goal."""
         size, observed = episode.goal.size, episode.observed
         found: list[Source] = []
-        for element, sign in [*self.drawn.turned, *self.drawn.copies]:
+        # Next to a pose the observation has no other one in the same three numbers.
+        known = [] if self.drawn.place.is_pose else [*self.drawn.turned, *self.drawn.copies]
+        for element, sign in known:
             is_world = np.allclose(observed[element : element + size], sign * episode.goal, atol=ROUNDING)
             for other in range(0 if is_world else observed.size - size + 1):
                 if abs(other - element) >= size:
