@@ -26,6 +26,8 @@ class DrawnPlace:
     name: str  # of the attribute
     elements: tuple[int, ...]
     later: tuple[tuple[int, ...], ...] = ()  # The elements of the goals after it, where there are several
+    is_part: bool = False  # whether it is one of several drawn elements
+    is_pose: bool = False  # whether the last number is an angle, and those before it are a place
 
     @property
     def size(self) -> int:
@@ -33,8 +35,15 @@ class DrawnPlace:
         return len(self.elements)
 
     @property
+    def is_place(self) -> bool:
+        """Whether all of it is a place."""
+        return not self.is_part and not self.is_pose
+
+    @property
     def axes(self) -> list[int]:
         """The axes of the world that the elements are, where places of links are compared with them."""
+        if self.is_pose:
+            return list(range(self.size - 1))
         return list(self.elements if max(self.elements) < SPACE else range(self.size))
 
     def find(self, env: Any) -> Attribute:
@@ -59,6 +68,21 @@ class DrawnPlace:
 
 
 @dataclasses.dataclass(frozen=True)
+class SeenPose:
+    """Where an observation has the way to a pose: that to its place, and the angle to it as cosine and sine."""
+
+    place: int  # the first element of the way
+    size: int  # of the way
+    cosine: int
+    sine: int
+
+    def join(self, observed: Numbers) -> Numbers:
+        """Return the way, and the angle [rad]. Shape (size + 1,)."""
+        angle = np.arctan2(observed[self.sine], observed[self.cosine])
+        return np.append(observed[self.place : self.place + self.size], angle)
+
+
+@dataclasses.dataclass(frozen=True)
 class DrawnGoal:
     """A place that each reset draws."""
 
@@ -69,6 +93,11 @@ class DrawnGoal:
     reaches: Mapping[Source, Reach]  # of links of a fixed robot, by where the observation has their places
     scales: Mapping[int, float] = dataclasses.field(default_factory=dict)
     """How many units of the observation a unit of the place is, by the elements of `turned`."""
+    pose: SeenPose | None = None  # What `extend` appends to an observation
+
+    def extend(self, observed: Numbers) -> Numbers:
+        """Return an observation with the way to a pose appended, which it has in other numbers. Shape (elements,)."""
+        return observed if self.pose is None else np.append(observed, self.pose.join(observed))
 
     def read_scale(self, element: int) -> float:
         """Return how many units of the observation a unit of the place is, where it has the way to it."""
@@ -81,7 +110,7 @@ class DrawnGoal:
 
     def name_axis(self, axis: int) -> str:
         """Name an element of the place: `self.goal[1]`."""
-        is_number = self.place.elements == (0,)
+        is_number = self.place.elements == (0,) and not self.place.is_part
         return self.name if is_number else f"{self.name}[{self.place.elements[axis]}]"
 
 

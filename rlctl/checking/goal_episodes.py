@@ -110,7 +110,9 @@ class GoalTrials:
         """Return where it may have the place of something else, in a frame in which it has the goal."""
         size, observed = episode.goal.size, episode.observed
         found: list[Source] = []
-        for element, sign in [*self.drawn.turned, *self.drawn.copies]:
+        # Next to a pose the observation has no other one in the same three numbers.
+        known = [] if self.drawn.place.is_pose else [*self.drawn.turned, *self.drawn.copies]
+        for element, sign in known:
             is_world = np.allclose(observed[element : element + size], sign * episode.goal, atol=ROUNDING)
             for other in range(0 if is_world else observed.size - size + 1):
                 if abs(other - element) >= size:
@@ -131,6 +133,11 @@ class GoalTrials:
             if tried == PLACED_EPISODES:
                 return True
         return False
+
+    def is_success_after(self, seed: int, source: Source, steps: int) -> bool:
+        """Say whether the step after so many is a success with the goal at a place of the observation."""
+        episode = GoalEpisode(self, seed, "repeated", steps)
+        return not episode.has_ended and bool(episode.step(episode.read(source)).succeeds)
 
     def find_place(self, source: Source, seed: int, actions: str = "repeated") -> Numbers | None:
         """Return what is a place by a source, after a few steps, by default with the action that the seed draws; None
@@ -188,7 +195,7 @@ class GoalEpisode:
         moment = self._player.reset()
         self._attribute = self._place.find(self._instance.env)
         self.goal = self._place.pick(self._attribute)
-        self.observed = flatten_floats(self._instance.leaves, moment.observation)  # Shape (elements,)
+        self.observed = self._flatten(moment)  # Shape (elements,)
         self.play([None] * first)
         if not self.has_ended:
             trials.begun.keep(self._player, (seed, actions, first), vars(self))
@@ -206,6 +213,9 @@ class GoalEpisode:
         self._player.resume(first)
         return True
 
+    def _flatten(self, moment: Moment) -> Numbers:
+        return self._trials.drawn.extend(flatten_floats(self._instance.leaves, moment.observation))
+
     @property
     def has_ended(self) -> bool:
         """Whether there is no other step."""
@@ -218,7 +228,7 @@ class GoalEpisode:
             self.goal = goal
         self._goals.append(goal)
         moment = self._player.step()
-        self.observed = flatten_floats(self._instance.leaves, moment.observation)
+        self.observed = self._flatten(moment)
         succeeds = _read_success(moment)
         self.has_succeeded |= bool(succeeds)
         return GoalStep(moment.reward_number, succeeds)
@@ -253,11 +263,23 @@ class GoalEpisode:
 
     def _read_turned(self, source: Source) -> Numbers:
         key = source, self._seed, self._actions, len(self._goals)
+        if key not in self._trials.turned_places and self.has_moved_on:
+            self._read_beside(source)  # this observation has the way to another goal already
         if key not in self._trials.turned_places:
             part = read_part(source, self.observed[None], self.goal.size)[0]
             way, *_ = np.linalg.lstsq(self.read_turn(source[0]), part, rcond=None)
             self._trials.turned_places[key] = self.goal - way
         return self._trials.turned_places[key]
+
+    def _read_beside(self, source: Source) -> None:
+        """Read a place in the same steps with the goal that was drawn; leave the environment as this episode did."""
+        first = min(self._first, len(self._goals))
+        other = GoalEpisode(self._trials, self._seed, self._actions, first, together=self._together)
+        other.play([None] * (len(self._goals) - first))
+        if not other.has_moved_on:
+            other.read(source)
+        again = GoalEpisode(self._trials, self._seed, self._actions, first, together=self._together)
+        again.play(self._goals[first:])
 
     def read_turn(self, element: int) -> Numbers:
         """Return how the observation turns the way to the goal, after a step. Shape (size, size). The same steps are

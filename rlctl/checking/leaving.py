@@ -1,7 +1,8 @@
 """Whether the reward rises as the robot leaves the object that it has to bring to the goal."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ KINDS = ("random", "repeated", "extreme", "random", "repeated", "extreme")
 STEPS, FEWEST_STEPS = 60, 60  # of an episode at most; those that are judged
 EPISODES = 3  # in which the object is looked for
 SAME, RESTS, MOVES = 1e-3, 1e-4, 2e-2  # parts of the goals' range: the same place; what rests, and what moves
+PARTLY = 0.5  # the same, of one of two points
 SURE = 0.9  # correlation with the distance, of what the action does not explain of the reward
 Numbers = NDArray[np.float64]
 
@@ -44,7 +46,7 @@ class _LeavingStep:
 def find_leaving(trials: GoalTrials, source: Source) -> Leaving | None:
     """Return what in a robot is paid for its distance from an object, where the object, read by `source`, has to be at
     the goal; None where that costs, pays nothing, or nothing has to be brought."""
-    items = _find_items(trials, source)
+    items = [] if trials.drawn.place.is_part else _find_items(trials, source)
     looks = list(_play(trials)) if items else []
     span = float(np.linalg.norm(trials.range))
     for item in items:
@@ -65,7 +67,7 @@ def _find_items(trials: GoalTrials, source: Source) -> list[str]:
     for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
         episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
         points = PointReader(trials.instance, trials.drawn.place.axes).read()
-        place = episode.read(source)
+        place = episode.read(source)[: len(trials.drawn.place.axes)]
         near = {name for name, point in points.items() if np.linalg.norm(point - place) < SAME * span}
         common = near if common is None else common & near
     return sorted(common or ())
@@ -95,23 +97,38 @@ def _fit(looks: list[_LeavingStep], item: str, items: list[str], span: float) ->
     left = _remove(columns, rewards)
     if not np.isfinite(left).all() or np.linalg.norm(left) <= 1e-9 * max(1.0, float(np.abs(rewards).max())):
         return None
-    best, found = SURE, None
-    for name in looks[0].after:
-        if name in items or not all(name in look.after and name in look.before for look in looks):
-            continue
-        distances = np.array([np.linalg.norm(look.after[name] - look.after[item]) for look in looks])
-        earlier = np.array([np.linalg.norm(look.before[name] - look.before[item]) for look in looks])
-        for is_change, column in ((True, distances - earlier), (False, distances)):
-            if np.ptp(distances) < MOVES * span:
-                continue
+
+    def relate(names: Sequence[str]) -> Iterator[tuple[float, Leaving]]:
+        """Yield how the rewards go with the sum of the distances of some points, and with its changes."""
+        after = sum((_measure(looks, name, item, "after") for name in names), np.zeros(len(looks)))
+        before = sum((_measure(looks, name, item, "before") for name in names), np.zeros(len(looks)))
+        for is_change, column in ((True, after - before), (False, after)):
             rest = _remove(columns, column)
             size = float(rest @ rest)
-            if size <= 1e-12 * float(column @ column):
-                continue
-            correlation = float(rest @ left) / float(np.sqrt(size) * np.linalg.norm(left))
-            if abs(correlation) > best:
-                best, found = abs(correlation), Leaving(name, item, float(rest @ left) / size, is_change, len(looks))
-    return found if found is not None and found.slope > 0 else None
+            if np.ptp(after) >= MOVES * span and size > 1e-12 * float(column @ column):
+                correlation = float(rest @ left) / float(np.sqrt(size) * np.linalg.norm(left))
+                slope = float(rest @ left) / size
+                yield correlation, Leaving(" and ".join(names), item, slope, is_change, len(looks))
+
+    known = [name for name in looks[0].after if name not in items and _is_known(looks, name)]
+    singles = [(name, found) for name in known for found in relate([name])]
+    # A hand has two fingers, or more: each of them explains a part.
+    parts = list(dict.fromkeys(name for name, found in singles if found[0] > PARTLY))
+    fingers = [found for pair in itertools.combinations(parts, 2) for found in relate(pair)]
+    for founds in ([found for _, found in singles], fingers):
+        correlation, leaving = max(founds, key=lambda found: abs(found[0]), default=(0.0, None))
+        if leaving is not None and abs(correlation) > SURE:
+            return leaving if correlation > 0 else None
+    return None
+
+
+def _is_known(looks: Sequence[_LeavingStep], name: str) -> bool:
+    return all(name in look.after and name in look.before for look in looks)
+
+
+def _measure(looks: Sequence[_LeavingStep], name: str, item: str, when: str) -> Numbers:
+    """Return how far a point is from the object `before` or `after` each step."""
+    return np.array([np.linalg.norm(getattr(look, when)[name] - getattr(look, when)[item]) for look in looks])
 
 
 def _remove(columns: Numbers, values: Numbers) -> Numbers:

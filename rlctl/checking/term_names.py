@@ -32,10 +32,11 @@ OPPOSITE_WORDS = {
 
 TIME_WORDS = {"delay", "duration", "elapsed", "step", "steps", "time", "timestep"}
 GOAL_WORDS = {
-    "arrival", "arrived", "complete", "completed", "dist", "distance", "done", "finish", "finished", "goal", "progress",
-    "reach", "reached", "reaching", "success", "target", "waypoint", "waypoints",
+    "arrival", "arrived", "complete", "completed", "dist", "distance", "done", "finish", "finished", "goal", "goals",
+    "progress", "reach", "reached", "reaching", "success", "target", "targets", "waypoint", "waypoints",
 }  # fmt: skip
 """What terms are named after where a task has an end that is to come soon."""
+PLACE_WORDS = {"goal", "goals", "target", "targets", "waypoint", "waypoints"}
 STEPPING_WORDS = {"clearance", "airtime", "swing", "lift", "liftoff"}
 """What feet do while a robot walks, and not while it stands."""
 GRASP_WORDS = {"grasp", "grasped", "grasping", "grip", "gripping", "pinch", "hold", "holding", "clamp", "squeeze"}
@@ -69,6 +70,11 @@ def is_about_time(name: str) -> bool:
 def is_about_goals(name: str) -> bool:
     """Say whether a term is about a place or a state that ends the task, or the next part of it."""
     return bool(set(split_name(name)) & GOAL_WORDS)
+
+
+def is_place(name: str) -> bool:
+    """Say whether a name calls it a place or a state that has to be reached."""
+    return bool(set(split_name(name)) & PLACE_WORDS)
 
 
 def is_error(name: str) -> bool:

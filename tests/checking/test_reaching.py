@@ -1,4 +1,4 @@
-"""RL605, RL622, RL626, RL627: what plays that reach the goal pay, where the reward is one number."""
+"""RL605, RL622, RL626, RL627, RL637, RL638: what plays that reach the goal pay, where the reward is one number."""
 
 import pytest
 
@@ -9,6 +9,7 @@ def broken(name, twin, file="broken_reaching.py", **settings):
     return case(f"{file}:{name}", (name[:5], "warning"), twin=f"{file}:{twin}", **settings)
 
 
+PHASES = "broken_phases.py"
 CASES = [
     broken("RL605SailboatPaidPerStep", "Sailboat", slow=True),
     broken("RL627SailboatOldBuoy", "Sailboat", slow=True),
@@ -17,6 +18,15 @@ CASES = [
     broken("RL622DiscOtherAxes", "DiscWithBlock", slow=True),
     broken("RL622PointCopterAbove", "PointCopter", slow=True),
     broken("RL626SledTwoFrames", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
+    broken("RL638RoverPaidForTheFirst", "RoverPhases", PHASES, pybullet=True),
+    broken("RL638PointerPaidForTheFirst", "Pointer", PHASES, pybullet=True, slow=True),
+    broken("RL638ArmPaidForTheFirst", "ArmPhases", PHASES, pybullet=True, slow=True),
+    broken("RL637FlyerCountsFromTheStart", "FlyerSeeks", PHASES, pybullet=True, slow=True),
+    broken("RL637BoatCountsFromTheStart", "BoatSeeks", PHASES, pybullet=True, slow=True),
+    broken("RL637ReacherCountsFromTheStart", "ReacherSeeks", PHASES, pybullet=True, slow=True),
+    broken("RL627TwoHandsOldGoal", "TwoHands", PHASES, pybullet=True, slow=True),
+    broken("RL622TwoHandsStayAway", "TwoHands", PHASES, pybullet=True, slow=True),
+    broken("RL622DoorWithoutASize", "Door", PHASES, pybullet=True, slow=True),
     broken("RL622SledLeavesCube", "Sled", "broken_reaching_bullet.py", pybullet=True, slow=True),
 ]
 

@@ -29,7 +29,14 @@ CASES = [
     broken("RL605RoverRestsNear", "RoverFindsLittle", INCOMES, slow=True),
     broken("RL605ArmRestsNear", "ArmFindsLittle", INCOMES, slow=True),
     broken("RL605PuckCountsFromTheStart", "PuckFindsLittle", INCOMES, slow=True),
-    broken("RL605CartCountsFromTheStart", "CartFindsLittle", INCOMES, slow=True),
+    case(
+        f"{INCOMES}:RL605RL637CartCountsFromTheStart",
+        ("RL605", "warning"),
+        ("RL637", "warning"),
+        twin=f"{INCOMES}:CartFindsLittle",
+        pybullet=True,
+        slow=True,
+    ),
 ]
 
 

@@ -5,7 +5,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rlctl.checking.drawn_goals import TURNED, DrawnGoal, DrawnPlace, Numbers, Source, find_sources, read_place
+from rlctl.checking.drawn_goals import (
+    TURNED,
+    DrawnGoal,
+    DrawnPlace,
+    Numbers,
+    SeenPose,
+    Source,
+    find_sources,
+    read_place,
+)
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.experiments.episodes import EPISODES
@@ -21,6 +30,7 @@ from rlctl.checking.workspaces import Reach, find_chains, measure_reach
 
 SIZES = (1, 2, 3)  # of a place [numbers]
 MOST_CANDIDATES = 6
+MOST_PARTS = 3  # elements of a goal, each of which may be one by itself, such as the angle of a door
 STEPS = 3  # in which a goal does not change
 SHIFT = np.array([0.013, -0.021, 0.034])  # of a goal, to see what of the observation follows it
 PART = 5e-7  # of observations, that float32 rounds
@@ -29,6 +39,7 @@ COMPARED = 4  # resets after which the places of links are compared with the obs
 SMALLER_UNITS = (100.0, 1000.0)  # times as many of them [cm, mm]
 SCALED_GOAL = "goal in a smaller unit"
 NEAR = 2e-3  # how near they are [m]
+SAME_ANGLE = 2e-7  # of numbers near 1, that float32 rounds
 TURN_ERROR = 1e-3  # of a turn that the observation has
 LEAST_SCALE, SCALED_ROUNDING = 1e-3, 2e-7  # of a way in the observation, and what float32 makes of it
 
@@ -57,6 +68,10 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
     for place in places:
         copies, scales = find_copies(instance, place), _find_turned(instance, place)
         turned = [(element, TURNED) for element in scales]
+        pose = None if copies or turned else _find_pose(instance, place)
+        if pose is not None:
+            place = dataclasses.replace(place, is_pose=True)
+            turned = [(_observe(instance, place, 0.0).size, TURNED)]
         if copies or turned:
             goals: dict[int, list[float]] = {}
             for seed in [*range(FIRST_SEED, FIRST_SEED + len(EPISODES)), *range(FIRST, FIRST + STARTS)]:
@@ -64,7 +79,7 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
                     break
                 instance.reset(seed)
                 goals[seed] = place.read(instance.env).tolist()
-            drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies), scales)
+            drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies), scales, pose)
             yield Fact("goals", drawn)
             yield from judges_goals.judge(GoalTrials(instance, drawn))
             return
@@ -140,12 +155,14 @@ def _list_places(one: Attribute, two: Attribute) -> list[DrawnPlace]:
             of_rows = [tuple(row * rows[1] + column for column in columns) for row in range(rows[0])]
             return [DrawnPlace(one.name, of_rows[0], tuple(of_rows[1:]))]
         return []
+    parts = [DrawnPlace(one.name, (element,), is_part=True) for element in drawn[:MOST_PARTS] if size > 1]
+    parts = parts if is_about_goals(one.name) else []
     if len(drawn) not in SIZES or len(drawn) < min(2, size):
-        return []
+        return parts
     found = [DrawnPlace(one.name, tuple(range(size)))] if size in SIZES else []
     if len(drawn) < size:
         found.append(DrawnPlace(one.name, drawn))
-    return found
+    return [*found, *parts]
 
 
 def find_copies(instance: Instance, place: DrawnPlace, factor: float = 1.0) -> list[tuple[int, int]]:
@@ -187,6 +204,37 @@ def _find_turned(instance: Instance, place: DrawnPlace) -> dict[int, float]:
     return found
 
 
+def _find_pose(instance: Instance, place: DrawnPlace) -> SeenPose | None:
+    """Return where the observation has the way to a place, turned or not, and the cosine and the sine of the angle to
+    the last number of a goal."""
+    size = place.size - 1
+    plain = _observe(instance, place, 0.0)
+    shifted = [_observe(instance, place, 1.0, TURN_SHIFT * axis) for axis in np.eye(place.size)]
+    if size < 1 or any(row.shape != plain.shape for row in shifted):
+        return None
+    changes = np.stack([row - plain for row in shifted]) / TURN_SHIFT  # shape (size + 1, elements)
+    rounding = TURN_ERROR + SAME_ANGLE * np.abs(plain).max() / TURN_SHIFT
+
+    def is_way(element: int) -> bool:
+        part = changes[:, element : element + size]
+        is_rotation = np.abs(part[:size] @ part[:size].T - np.eye(size)).max() < rounding
+        return bool(is_rotation and np.abs(part[size]).max() < rounding)
+
+    def is_angle(cosine: int, sine: int) -> bool:
+        rows = np.array([plain, *shifted])
+        if np.abs(np.hypot(rows[:, cosine], rows[:, sine]) - 1.0).max() > TURN_ERROR:
+            return False
+        turns = np.diff(np.unwrap(np.arctan2(rows[[0, -1]][:, sine], rows[[0, -1]][:, cosine]))) / TURN_SHIFT
+        is_own = np.abs(changes[:size, [cosine, sine]]).max() < rounding
+        return bool(is_own and abs(abs(turns[0]) - 1.0) < rounding)
+
+    ways = [element for element in range(plain.size - size + 1) if is_way(element)]
+    pairs = [(i + 1 - k, i + k) for i in range(plain.size - 1) for k in (1, 0)]
+    angles = [pair for pair in pairs if is_angle(*pair)]
+    # The order of cosine and sine does not show in one pair: the angle is 0 where the cosine is 1.
+    return SeenPose(ways[0], size, *angles[0]) if ways and angles else None
+
+
 def _observe(instance: Instance, place: DrawnPlace, shift: float, along: Numbers = SHIFT) -> Numbers:
     """Return the observation of the first step if the place is shifted before it. Shape (elements,)."""
     episode = EpisodePlayer(instance, FIRST_SEED, "zero", max_steps=1)
@@ -198,6 +246,8 @@ def _observe(instance: Instance, place: DrawnPlace, shift: float, along: Numbers
 
 def _find_reaches(instance: Instance, place: DrawnPlace, copies: Sequence[Source]) -> dict[Source, Reach]:
     """Return how far the links of fixed robots get whose places are observed, by where they are observed."""
+    if not place.is_place:  # a single number says too little of a place
+        return {}
     rows, goals, links = [], [], []
     for seed in range(FIRST_SEED, FIRST_SEED + COMPARED):
         first = EpisodePlayer(instance, seed, max_steps=0).reset()

@@ -11,6 +11,8 @@ from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, OutOfTime, Rule, RuleFinding, Severity
+from rlctl.checking.rules.rl637_progress_is_counted_from_the_start import RULE as FROM_START
+from rlctl.checking.rules.rl637_progress_is_counted_from_the_start import is_previous
 from rlctl.checking.values import Attribute, find_assignment, find_unequal, flatten, read_attributes
 
 RULE = Rule(
@@ -32,7 +34,7 @@ REGRESSED_RESETS = 60  # Resets over which an attribute is predicted from the ob
 SHOWN = 0.9  # part of an attribute's variance that the observation has to explain
 
 
-@experiment("hidden state", INSTANCES, 70, RULE, share=1.5)
+@experiment("hidden state", INSTANCES, 70, RULE, FROM_START, share=1.5)
 def change_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play one episode again and again, each time with one attribute as reset drew it for another seed."""
     with context.fresh() as instance:
@@ -45,9 +47,15 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
             raise NotApplicable("the observation never changes: a bandit, or RL110")
         for name, other in _find_drawn(instance, trials).items():
             frames = _play_changed(instance, trials, name, other)
-            if frames is not None and _hides(plain, frames) and not _is_shown(instance, name):
+            if frames is None or not _hides(plain, frames):
+                continue
+            if is_previous(name):
+                yield _count_from_start(instance, name, plain, frames)
+            elif _is_shown(instance, name):
+                continue
+            else:
                 yield _hidden(instance, name, plain, frames)
-                return
+            return
 
 
 def _find_drawn(instance: Instance, trials: Trials) -> dict[str, Attribute]:
@@ -101,10 +109,23 @@ def explains(observed: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool
 
 
 def _hidden(instance: Instance, name: str, plain: Sequence[Frame], changed: Sequence[Frame]) -> RuleFinding:
-    step = int(np.argmax([abs(a[REWARD] - b[REWARD]) for a, b in zip(plain, changed, strict=False)]))
-    value, expected = float(changed[step][REWARD]), float(plain[step][REWARD])
+    step, value, expected = _find_largest(plain, changed)
     fault = f"reset draws {name}, the reward uses it, and the observation does not show it"
     proof = "with the value of another seed the same episode has the same observations"
     message = f"{fault}: {proof}, and at step {step} the reward {value:.4g} instead of {expected:.4g}"
     evidence = {"element": name, "seed": FIRST_SEED, "step": step, "value": value, "expected": expected}
     return RuleFinding(RULE, message, evidence, where=find_assignment(instance.env, name))
+
+
+def _count_from_start(instance: Instance, name: str, plain: Sequence[Frame], changed: Sequence[Frame]) -> RuleFinding:
+    step, value, expected = _find_largest(plain, changed)
+    fault = f"reset sets {name}, no step sets it again, and the reward of each step uses it"
+    proof = f"with the value of another seed step {step} pays {value:.4g} instead of {expected:.4g}"
+    evidence = {"element": name, "seed": FIRST_SEED, "step": step, "value": value, "expected": expected}
+    return RuleFinding(FROM_START, f"{fault}: {proof}", evidence, where=find_assignment(instance.env, name))
+
+
+def _find_largest(plain: Sequence[Frame], changed: Sequence[Frame]) -> tuple[int, float, float]:
+    """Return the step whose reward differs most, and this reward and the unchanged one."""
+    step = int(np.argmax([abs(a[REWARD] - b[REWARD]) for a, b in zip(plain, changed, strict=False)]))
+    return step, float(changed[step][REWARD]), float(plain[step][REWARD])

@@ -92,7 +92,7 @@ def _move_goal_around(trials: GoalTrials) -> Iterator[RuleFinding]:
     """Yield a finding where the reward jumps with the goal in the direction pi from the robot, whatever its heading."""
     sources = [trials.at_goal.source, *trials.drawn.turned, *trials.drawn.copies]
     source = next((one for one in sources if one is not None), None)
-    if source is None or trials.drawn.place.size < 2:
+    if source is None or trials.drawn.place.size < 2 or trials.drawn.place.is_pose:
         return
     sizes: list[float] = []
     for number in range(MOST_SEEDS):

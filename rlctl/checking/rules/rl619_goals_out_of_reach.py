@@ -40,6 +40,8 @@ FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
 def _find_goals_out_of_reach(records: Records) -> Iterator[RuleFinding]:
     rewards.require_rewarded(records)
     drawn: DrawnGoal = records.require_fact("goals")
+    if not drawn.place.is_place:
+        raise NotApplicable("the goal is no place")
     steps = collect_transitions(records, with_constants=True)
     steps = steps.select(np.isin(steps.seeds, list(drawn.goals)))
     goals = np.array([drawn.goals[seed] for seed in steps.seeds.tolist()])

@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.drawn_goals import Numbers, Source
 from rlctl.checking.experiments.goals import judges_goals
@@ -37,6 +38,7 @@ RULE = Rule(
 FIRST_STEPS = 10  # with the action that the episode holds, so that the robot is somewhere else in each
 LATER_STEPS = 2  # with the goal moved: the first may pay the way to it as progress
 EPISODES, MOST_EPISODES = 3, 10  # that are needed, and that are tried
+TRACED_STEPS = 60  # in which large actions may move it
 FEWEST_MOVED = 0.02  # part of the goals' range: how far apart the robot is in these episodes
 RADII = (0.35, 0.7, 1.0)  # parts of the goals' range
 WAY_RADIUS, WAY = 0.7, 0.2
@@ -86,6 +88,8 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         yield Skipped(RULE.id, _explain_few(len(insides)))
         return
     moved = np.ptp(np.array([inside.place for inside in insides.values()]), axis=0) > FEWEST_MOVED * trials.range
+    if not moved.any():
+        moved = _find_moved(trials, list(insides))
     looks: list[tuple[_MeasureAxis, _Describe]] = [
         (_measure_sides, _describe_distance),
         (_measure_ways, _describe_way),
@@ -108,6 +112,26 @@ def _compare_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         yield _describe_peak(trials, peaks)
 
 
+def _find_moved(trials: GoalTrials, numbers: Sequence[int]) -> NDArray[np.bool_]:
+    """Say along which axes that moves in longer episodes which is at the goal in these ones, where it has not moved
+    yet, as a door that nobody has touched. Shape (size,)."""
+    moved = np.zeros(trials.range.shape, np.bool_)
+    for source in trials.drawn.copies:
+        if all(trials.is_success_after(FIRST_SEED + number, source, FIRST_STEPS) for number in numbers):
+            moved |= np.ptp(np.vstack(list(_trace(trials, source))), axis=0) > FEWEST_MOVED * trials.range
+    return moved
+
+
+def _trace(trials: GoalTrials, source: Source) -> Iterator[Numbers]:
+    """Yield the places by a source in some episodes of large actions, while their goals stay."""
+    for number in range(EPISODES):
+        episode = GoalEpisode(trials, FIRST_SEED + number, "extreme")
+        for _ in episode.follow(itertools.repeat(None, TRACED_STEPS)):
+            if episode.has_moved_on:
+                break
+            yield episode.read(source)
+
+
 def _describe_peak(trials: GoalTrials, peaks: Sequence[Peak]) -> RuleFinding:
     name, places = trials.drawn.name, list_names([f"{peak.offset:.3g}" for peak in peaks])
     message = f"the reward is highest with {trials.drawn.name_axis(peaks[0].axis)} {places} away from where {name} is a"
@@ -117,7 +141,8 @@ def _describe_peak(trials: GoalTrials, peaks: Sequence[Peak]) -> RuleFinding:
 
 
 def _describe_leaving(trials: GoalTrials, leaving: Leaving) -> RuleFinding:
-    what = "goes away" if leaving.is_change else "is"
+    verbs = ("go away", "are") if " and " in leaving.point else ("goes away", "is")
+    what = verbs[0] if leaving.is_change else verbs[1]
     message = f"the reward rises by {leaving.slope:.3g} for each unit that {leaving.point} {what} from {leaving.item},"
     message += f" which has to be brought to {trials.drawn.name} ({leaving.steps} steps in which it rests)"
     return RuleFinding(RULE, message, {"element": trials.drawn.name, "value": leaving.slope, "expected": "below 0"})

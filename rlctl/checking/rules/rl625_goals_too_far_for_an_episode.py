@@ -34,7 +34,7 @@ MOVED = 1e-6  # part of the usual distance: what the action changes at least
 def _compare_ways(trials: GoalTrials) -> Iterator[ChildMessage]:
     """Play episodes with held actions, and compare how far they lead with how far the goals are."""
     source = trials.at_goal.source
-    if source is None:
+    if source is None or not trials.drawn.place.is_place:
         yield Skipped(RULE.id, "it is not known what has to be at the goal", applies=False)
         return
     usual = float(np.median(measure_distances(trials, source)))

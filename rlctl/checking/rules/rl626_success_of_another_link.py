@@ -34,6 +34,9 @@ MOVED, SAME_WAY = 0.02, 0.1  # how far an object is shifted [m], and the part by
 @judges_goals(RULE)
 def _find_other_link(trials: GoalTrials) -> Iterator[ChildMessage]:
     """Put the goal at each link of a fixed robot where nothing that is observed has to be at the goal."""
+    if not trials.drawn.place.is_place:
+        yield Skipped(RULE.id, "the goal is no place", applies=False)
+        return
     relative = [source for source in trials.drawn.copies if source in trials.drawn.reaches]
     objects = {} if relative else _find_object_sources(trials)
     at_goal = trials.at_goal

@@ -28,6 +28,7 @@ EPISODES, MOST_EPISODES = 3, 10  # in which the next goal came, that are needed 
 LEAST_WAY = 0.1  # part of the goals' range: what is farther is another goal
 CALM = 5.0  # times as large as the changes of later rewards
 SAME = 0.3  # relative difference of what is lost per way
+POSES, MOST_POSES, UNLIKE = 6, 16, 0.1  # episodes with poses, and what no price per way and per angle explains
 VARIED = 1.2  # the longest of the ways is so many times the shortest
 
 
@@ -35,6 +36,7 @@ class _Switch(NamedTuple):
     """A step after the goal has changed."""
 
     way: float  # to the new goal
+    turn: float  # and the angle to it, where a goal is a pose [rad]
     jump: float  # of the reward against the steps that follow
     noise: float  # how far these differ
 
@@ -49,21 +51,22 @@ def _find_counted_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
     known = trials.at_goal.source
     for source in trials.list_sources(episode) if known is None else [known]:
         switches: list[_Switch] = []
-        for seed in range(FIRST_SEED, FIRST_SEED + MOST_EPISODES):
+        fewest, most = (POSES, MOST_POSES) if trials.drawn.place.is_pose else (EPISODES, MOST_EPISODES)
+        for seed in range(FIRST_SEED, FIRST_SEED + most):
             switch = _play(trials, source, shown, seed)
             switches += [] if switch is None else [switch]
-            if (not switches and seed > FIRST_SEED) or _are_enough(switches):
+            if (not switches and seed > FIRST_SEED) or _are_enough(switches, fewest):
                 break
-        if _are_enough(switches):
+        if _are_enough(switches, fewest):
             yield from _judge(trials, switches)
             return
     yield Skipped(RULE.id, "no other goal followed when one was reached", applies=False)
 
 
-def _are_enough(switches: Sequence[_Switch]) -> bool:
+def _are_enough(switches: Sequence[_Switch], fewest: int) -> bool:
     """Say whether there are several, with ways so different that a bonus is none of them."""
     ways = [switch.way for switch in switches]
-    return len(ways) >= EPISODES and max(ways) > VARIED * min(ways)
+    return len(ways) >= fewest and max(ways) > VARIED * min(ways)
 
 
 def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Switch | None:
@@ -79,7 +82,8 @@ def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Swit
         episode.step(place)
         seen = _read(episode, shown) / trials.drawn.read_scale(shown[0])
         off = float(np.linalg.norm(seen - place)) if is_absolute else float(np.linalg.norm(seen))
-        expected = 0.0 if is_absolute else float(np.linalg.norm(place - begin))
+        # The way from what has to be at the goal is 0 there.
+        expected = 0.0 if is_absolute or source == shown else float(np.linalg.norm(place - begin))
         is_another = episode.has_moved_on or abs(off - expected) > LEAST_WAY * float(np.linalg.norm(trials.range))
         if episode.has_ended or is_another:
             break
@@ -88,10 +92,14 @@ def _play(trials: GoalTrials, source: Source, shown: Source, seed: int) -> _Swit
     way = episode.measure_distance(source) if source[1] and not is_absolute else off
     if way < LEAST_WAY * float(np.linalg.norm(trials.range)):
         return None
+    turn = 0.0
+    if trials.drawn.place.is_pose:
+        *along, turn = _read(episode, shown).tolist()
+        way = float(np.linalg.norm(along))
     rewards = np.array([step.reward for step in episode.play([None] * 4)])
     if len(rewards) < 4 or not np.isfinite(rewards).all():
         return None
-    return _Switch(way, float(rewards[0] - np.median(rewards[1:])), float(np.ptp(rewards[1:])))
+    return _Switch(way, abs(turn), float(rewards[0] - np.median(rewards[1:])), float(np.ptp(rewards[1:])))
 
 
 def _read(episode: GoalEpisode, shown: Source) -> Numbers:
@@ -99,14 +107,23 @@ def _read(episode: GoalEpisode, shown: Source) -> Numbers:
 
 
 def _judge(trials: GoalTrials, switches: Sequence[_Switch]) -> Iterator[RuleFinding]:
-    ways, jumps, noise = (np.array(column) for column in zip(*switches, strict=True))
-    lost = -jumps / ways
+    ways, turns, jumps, noise = (np.array(column) for column in zip(*switches, strict=True))
     is_clear = bool((jumps < -CALM * np.maximum(noise, 1e-6)).all())
-    if is_clear and np.ptp(lost) < SAME * lost.mean():
-        name, loss = trials.drawn.name, float(lost.mean())
+    if not is_clear:
+        return
+    columns = np.column_stack([ways, turns] if trials.drawn.place.is_pose else [ways])
+    lost = np.linalg.lstsq(columns, -jumps, rcond=None)[0]
+    if trials.drawn.place.is_pose:
+        is_lost = bool((lost >= 0).all() and np.abs(columns @ lost + jumps).max() < UNLIKE * np.abs(jumps).max())
+    else:
+        is_lost = np.ptp(-jumps / ways) < SAME * (-jumps / ways).mean()
+    if is_lost:
+        name, loss = trials.drawn.name, float((-jumps / ways).mean() if len(lost) == 1 else lost[0])
         message = (
             f"the step after {name} was reached pays {-jumps[0]:.3g} less than the following ones, and the next goal"
         )
-        message += f" is {ways[0]:.3g} away: {loss:.3g} per way in {len(switches)} episodes, as if the robot had moved"
+        message += f" is {ways[0]:.3g} away: {loss:.3g} per way"
+        message += f" and {lost[1]:.3g} per rad" if len(lost) > 1 else ""
+        message += f" in {len(switches)} episodes, as if the robot had moved"
         evidence = {"element": name, "seed": FIRST_SEED, "value": float(jumps[0]), "expected": 0.0}
         yield RuleFinding(RULE, message, evidence)
