@@ -17,13 +17,13 @@ from rlctl.checking.values import Attribute, find_unequal, read_attributes, shap
 
 RULE = Rule(
     "RL638",
-    "the reward follows another goal than the observation",
+    "reward follows another goal",
     Severity.WARNING,
     meaning="""
         reset draws several goals, one after the other, and for a while the observation shows one of them and the
-        reward pays for another: a policy that does what it sees earns nothing. rlctl replaced one goal after the other
-        and played the same episode: in the same steps only one of them changed the observations, and only another one
-        changed the rewards.
+        reward pays for another: a policy that does what it sees earns nothing. One goal after the other was replaced
+        while the same episode was played: in the same steps only one of them changed the observations, and only
+        another one changed the rewards.
     """,
     fix="Choose the goal in one place, which the observation, the reward and the success read.",
 )
