@@ -220,10 +220,12 @@ class RL129TugInTheWorld(InTheWorld, Tug): ...
 class RL129GlintInTheWorld(InTheWorld, Glint): ...
 
 
-class RL636TugPaidLate(PaidLate, Tug): ...
+class RL636TugPaidLate(PaidLate, Tug):
+    rlctl_ignore = {**Tug.rlctl_ignore, "RL622": "it is paid for where it was"}
 
 
-class RL636GlintPaidLate(PaidLate, Glint): ...
+class RL636GlintPaidLate(PaidLate, Glint):
+    rlctl_ignore = {**Glint.rlctl_ignore, "RL622": "it is paid for where it was"}
 
 
 class RL832TugFast(FastPlace, Tug): ...
@@ -244,6 +246,8 @@ class TugWithACompass(RL129TugInTheWorld):
 
 class RL129TugTurnedTwice(Tug):
     """The velocity is turned by the heading in the wrong direction, the way is right."""
+
+    rlctl_ignore = {**Tug.rlctl_ignore, "RL124": "the velocity and its rate show it as well"}
 
     def speed(self):
         return level(self.velocity, self.heading)

@@ -106,6 +106,8 @@ class RL124ProbeBeacon(Probe):
 
 
 class RL130ProbePoint(Probe):
+    rlctl_ignore = {**Probe.rlctl_ignore, "RL701": "the tumbling hides a weak action"}
+
     def velocity(self):
         return self.turn().inv().apply(self.data.qvel[:3] - self.data.qpos[:3])
 
