@@ -27,6 +27,8 @@ class RL115BoatOldObservation(Boat):
 
 
 class RL115ArmOldObservation(Arm):
+    rlctl_ignore = {"RL815": "the engine shows it as well"}
+
     def move(self, action):
         self.before = super().observe()
         super().move(action)

@@ -14,12 +14,16 @@ CLEAN = [
     for task in getattr(module, "CLEAN", [])
 ]
 
+# A number in other units than the rest is on another scale, too: one message for a table, one for a network.
+CONSEQUENCES = {"RL119": {("RL118", "info")}}
+
 pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
-    assert found(case.broken) == case.expected
+    consequences = {one for rule in case.rules for one in CONSEQUENCES.get(rule, ())}
+    assert found(case.broken) - consequences == case.expected - consequences
     assert not {rule for rule, _ in found(case.twin)} & set(case.rules)
 
 
