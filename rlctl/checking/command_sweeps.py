@@ -14,6 +14,7 @@ from rlctl.checking.drawn_goals import DrawnGoal, DrawnPlace
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.instance import EnvironmentRaised, Instance
+from rlctl.checking.mujoco_worlds import FREE
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.snapshots import Beginnings, Snapshot
 from rlctl.environments.bullet_clients import ClientCalls
@@ -31,7 +32,6 @@ SMALL = 0.05  # part of that interval in which rewards may round to the same
 SAME = 1e-12  # relative error of rewards
 STRAIGHT = 1e-6  # part of the change of a reward by which a line may be missed
 DRAWN = 9  # resets, whose commands give the range
-FREE = 0  # MuJoCo's type of a joint
 
 
 @dataclasses.dataclass(frozen=True)

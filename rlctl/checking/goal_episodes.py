@@ -250,6 +250,17 @@ class GoalEpisode:
             left -= 1
         return step
 
+    def lead(self, source: Source, before: Numbers, offsets: Iterable[Numbers]) -> Iterator[tuple[GoalStep, Numbers]]:
+        """Take a step for each offset, with the goal so far from where the robot gets if it moves as in the step
+        before; `before` is where it was then. Yield the steps, and where the robot was before each; less if the
+        episode ends."""
+        for offset in offsets:
+            if self.has_ended:
+                return
+            place = self.read(source)
+            yield self.step(2 * place - before + offset), place
+            before = place
+
     @property
     def has_moved_on(self) -> bool:
         """Whether the environment has replaced the goal that the last step was given."""

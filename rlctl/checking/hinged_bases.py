@@ -8,11 +8,11 @@ import numpy as np
 
 from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.instance import Instance
+from rlctl.checking.mujoco_worlds import FREE, HINGE, SLIDE
 from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 from rlctl.task.rotations import from_axis, multiply, rotate
 
-FREE, SLIDE, HINGE = 0, 2, 3  # MuJoCo's types of a joint
 UP, UPRIGHT = (0.0, 0.0, 1.0), 1 - 1e-6
 NEAR = 1e-6  # how far from the origin a hinge may be [m]
 CONTINUOUS = 0  # PyBullet's type of a joint that turns

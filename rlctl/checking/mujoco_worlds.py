@@ -33,7 +33,7 @@ from rlctl.checking.worlds import (
 )
 from rlctl.environments.info import find_mujoco
 
-FREE, BALL, SLIDE = 0, 1, 2  # MuJoCo's types of joints; 3 is a hinge
+FREE, BALL, SLIDE, HINGE = range(4)  # MuJoCo's types of joints
 PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
 ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
 LINEAR = (FIXED_GAIN, AFFINE)

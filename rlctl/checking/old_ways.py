@@ -11,10 +11,8 @@ from rlctl.checking.worlds import Array
 SIZES = (3, 2)  # of a place
 MOST_PLACES, MOST_BLOCKS = 12, 40
 LEAST_MOTION = 1e-3  # standard deviation of what moves
-OLD_FITS, PRESENT_FAILS = (
-    1e-3,
-    10.0,
-)  # part of the variance that is left; and how many times more the present one leaves
+OLD_FITS = 1e-3  # part of the variance that the place of the step before leaves at most
+PRESENT_FAILS = 10.0  # how many times more the present one leaves
 FEWEST_STEPS = 60
 FEWEST_OF_EPISODE = 15
 EQUAL = 1e-12

@@ -80,15 +80,11 @@ def _pay(
     before = episode.read(source)
     episode.play([None])
     rewards: list[float] = []
-    for number, offset in enumerate(offsets):
-        if episode.has_ended:
-            return None
-        place = episode.read(source)
-        step = episode.step(2 * place - before + offset * np.eye(place.size)[axis])
-        before = place
-        if number and bool(step.succeeds) != succeeds:
+    along = np.eye(before.size)[axis]
+    for step, _ in episode.lead(source, before, (offset * along for offset in offsets)):
+        if rewards and bool(step.succeeds) != succeeds:
             return None
         rewards.append(step.reward)
-    if succeeds and episode.has_ended:
+    if len(rewards) < len(offsets) or (succeeds and episode.has_ended):
         return None
     return float(sum(rewards[1:]))

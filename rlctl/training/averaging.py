@@ -47,7 +47,7 @@ class ActorAverage:
         return {f"{_PREFIX}{name}": value.cpu().numpy().copy() for name, value in self._average.items()}
 
     def restore(self, tensors: Tensors) -> None:
-        """Restore what `take` returned; older checkpoints have none, then the average begins anew."""
+        """Restore what `take` returned; from older checkpoints, which have none, it begins with the weights."""
         self._average = {
             name: torch.from_numpy(tensors[f"{_PREFIX}{name}"].copy()).to(value.device)
             for name, value in self._read().items()

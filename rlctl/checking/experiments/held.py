@@ -16,6 +16,7 @@ from rlctl.checking.episode import EpisodePlayer, zero_action
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.experiments.episodes import ENDLESS_STEPS, ENOUGH_EPISODES, EPISODES
 from rlctl.checking.instance import Context, Instance
+from rlctl.checking.mujoco_worlds import FREE
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats
@@ -26,7 +27,6 @@ STEPS, STEPS_WITHOUT_LIMIT = 450, 1_100  # of an episode that declares a time li
 SEEDS = 3
 WAYS = ((0.003, 0.002), (-0.003, -0.002))  # [m] in a step: nearer to any goal, but for one right beside them
 SETTLED = 10  # steps, after which what is solved again and again no longer changes
-FREE = 0  # MuJoCo's type of a joint
 STATE = ("qpos", "qvel", "act", "qacc_warmstart")  # not the time, which goes on
 Rows = NDArray[np.float64]
 

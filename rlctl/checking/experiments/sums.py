@@ -12,6 +12,7 @@ from rlctl.checking.bullet_worlds import read_states, read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.instance import Context, Instance
+from rlctl.checking.mujoco_worlds import SLIDE
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats, name_floats
@@ -23,7 +24,6 @@ from rlctl.environments.info import find_mujoco
 RANDOM_STEPS, FEWEST_STEPS = 16, 10
 SAME = 1e-3  # part of the largest change: what float32 makes of an action
 USUAL = 0.75  # part of the random steps in which a number follows the action: it may be clipped in others
-FIRST_SINGLE = 2  # MuJoCo's type of a slide; after it that of a hinge
 MOTOR_CALLS = ("setJointMotorControl2", "setJointMotorControlArray")
 
 
@@ -87,7 +87,7 @@ class SumTrials:
         everything: list[Array] = []
         if (simulation := find_mujoco(self.instance.env)) is not None:
             model, data = simulation
-            single = np.flatnonzero(model.jnt_type >= FIRST_SINGLE).tolist()
+            single = np.flatnonzero(model.jnt_type >= SLIDE).tolist()
             names += [model.joint(joint).name or f"joint {joint}" for joint in single]
             positions += data.qpos[model.jnt_qposadr[single]].tolist()
             everything += [data.qpos.copy(), data.qvel.copy()]

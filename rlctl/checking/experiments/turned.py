@@ -16,6 +16,7 @@ from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.instance import Context, Instance
+from rlctl.checking.mujoco_worlds import FREE
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rewards import TERMS
 from rlctl.checking.rule import NotApplicable, NotJudged
@@ -25,7 +26,7 @@ from rlctl.environments.bullet_clients import ClientCalls
 from rlctl.environments.info import find_mujoco
 from rlctl.task.rotations import from_axis, multiply, roll_pitch_yaw, rotate
 
-FREE, PLANE = 0, 0  # MuJoCo's types of a joint and a geom
+PLANE = 0  # MuJoCo's type of a geom
 UP = (0.0, 0.0, 1.0)
 ENDLESS = 1e5  # [m]; PyBullet's planes are larger
 LEVEL = 0.02  # how far static bodies may be above the lowest point of a robot [m]

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.engine_values import EngineValues, ScaledValue, find_scaled
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
@@ -57,11 +58,20 @@ class ObservedWorld:
             first += size
         return f"observation[{column}]"
 
+    @property
+    def sizes(self) -> list[int]:
+        """How many looks each episode has."""
+        return [len(log.observed) for log in self.logs]
+
+    @property
+    def episodes(self) -> NDArray[np.int_]:
+        """The number of the episode of each look."""
+        return np.repeat(np.arange(len(self.logs)), self.sizes)
+
     @functools.cached_property
     def scaled(self) -> list[ScaledValue]:
         """The elements of the observation that are a value of the engine times a factor, perhaps with noise."""
-        sizes = [len(log.observed) for log in self.logs]
-        return find_scaled(EngineValues.read(self.logs), self.observed, sizes)
+        return find_scaled(EngineValues.read(self.logs), self.observed, self.sizes)
 
 
 @dataclasses.dataclass(frozen=True)

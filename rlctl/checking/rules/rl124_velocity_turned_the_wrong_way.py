@@ -62,9 +62,7 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
             for vectors in [*_list_velocities(one), *_list_gravities(one)]
             for finding in _find_in_observation(one.observed, vectors)
         ]
-        sizes = [len(log.observed) for log in one.logs]
-        episodes = np.repeat(np.arange(len(sizes)), sizes)
-        yield from found or _find_directions(one.observed, episodes, list_world_turns(one))
+        yield from found or _find_directions(one.observed, one.episodes, list_world_turns(one))
 
 
 @judges_records(RULE, "worlds", "attributes")

@@ -48,13 +48,11 @@ TWICE = (2, -2)
 @judges_worlds(RULE)
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for one in [*watched.observed, *watched.thrown]:
-        sizes = [len(log.observed) for log in one.logs]
-        episodes = np.repeat(np.arange(len(sizes)), sizes)
         names, parts = name_observed(watched.instance.env, one)
         angles = {scaled.column for scaled in one.scaled if scaled.value.is_angle}  # neither places nor velocities
         parts = [f"{part}[{i}]" if i in angles else part for i, part in enumerate(parts)]
         seconds = float(np.median(np.concatenate([np.diff(log.times) for log in one.logs])))
-        for misfit in find_misfits(one.observed, parts, episodes, list_world_turns(one), seconds):
+        for misfit in find_misfits(one.observed, parts, one.episodes, list_world_turns(one), seconds):
             yield _describe(misfit, *(name_part(names[part]) for part in misfit[:2]))
             return
 

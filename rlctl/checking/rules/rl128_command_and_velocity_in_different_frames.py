@@ -78,10 +78,7 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 
 
 def _read_steps(one: ObservedWorld) -> _Steps:
-    sizes = [len(log.observed) for log in one.logs]
-    is_first = np.zeros(sum(sizes), np.bool_)
-    is_first[np.cumsum([0, *sizes[:-1]])] = True
-    after = np.flatnonzero(~is_first)
+    after = 1 + np.flatnonzero(np.diff(one.episodes) == 0)
     turns = [turn.select(after) for turn in list_world_turns(one)]
     told = [numbers for log in one.logs for numbers in log.told]
     rewards = np.array([reward for log in one.logs for reward in log.rewards])[after]

@@ -298,12 +298,7 @@ def _measure(trials: GoalTrials, source: Source, number: int, offsets: Numbers) 
     outcome = None
     if episode.has_succeeded:
         return None
-    for offset in offsets:
-        if episode.has_ended:
-            break
-        place = episode.read(source)
-        step = episode.step(2 * place - before + offset)
-        before = place
+    for step, place in episode.lead(source, before, offsets):
         outcome = _Outcome(step.reward, bool(step.succeeds), episode.has_ended, place)
     return outcome
 
