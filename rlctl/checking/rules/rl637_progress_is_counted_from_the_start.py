@@ -9,9 +9,9 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The reward pays progress, the distance before minus the distance now, and the distance before is set in reset
-        and never again: each step is paid for the whole way since the start, also those in which nothing moves. rlctl
-        replaced an attribute that is named after the previous step: the same episode then had the same observations,
-        and other rewards in most steps, not only in the first one.
+        and never again: each step is paid for the whole way since the start, also those in which nothing moves. The
+        check replaced an attribute that is named after the previous step: the same episode then had the same
+        observations, and other rewards in most steps, not only in the first one.
     """,
     fix="Set the previous value in each step, after the reward is computed.",
 )
