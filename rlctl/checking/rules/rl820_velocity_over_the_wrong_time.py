@@ -25,6 +25,7 @@ from rlctl.checking.told_speeds import (
     read_engine_ways,
     read_told,
 )
+from rlctl.checking.timed_expressions import Use, find_wrong_time
 from rlctl.checking.transitions import name_floats
 from rlctl.checking.worlds import Array
 
@@ -85,7 +86,19 @@ def _find_told(one: ObservedWorld, changes: "_Changes", watched: WatchedWorlds) 
         return
 
 
-@judges_records(RULE, "worlds", "attributes")
+@judges_records(RULE, "worlds", "attributes", "expressions")
+def _judge_records(records: Records) -> Iterator[RuleFinding]:
+    for timed, times in find_wrong_time(records, Use.DIVIDED):
+        message = f"{timed.text} divides the change of a whole step by {timed.seconds:.4g} s; the step takes"
+        message += (
+            f" {times.control_s:.4g} s, {times.substeps} steps of the physics: it is {times.substeps} times too large"
+        )
+        evidence = {"element": timed.target, "value": timed.seconds, "expected": times.control_s}
+        yield RuleFinding(RULE, message, evidence, where=timed.where)
+        return
+    yield from _judge_attributes(records)
+
+
 def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
     """Yield what a robot without an engine tells."""
     log: AttributeLog | None = records.facts.get("attributes")

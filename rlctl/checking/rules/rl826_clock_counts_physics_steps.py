@@ -11,6 +11,7 @@ from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.step_times import StepTimes, require_step_times, words_of
+from rlctl.checking.timed_expressions import Use, find_wrong_time
 from rlctl.checking.transitions import find_float_leaves, find_unit_pairs
 from rlctl.checking.worlds import Array
 
@@ -79,7 +80,18 @@ class _Clock:
         return "advances" if self.advance > 0 else "falls"
 
 
-@judges_records(RULE, *RECORDING, "attributes")
+@judges_records(RULE, *RECORDING, "attributes", "expressions")
+def _judge(records: Records) -> Iterator[RuleFinding]:
+    for timed, times in find_wrong_time(records, Use.COUNTED):
+        message = f"{timed.target} advances by {timed.total_s:.4g} s in a step that takes {times.control_s:.4g} s"
+        message += f", with {timed.text}"
+        wrong = _name_wrong(timed.total_s, times)
+        evidence = {"element": timed.target, "value": timed.total_s, "expected": times.control_s}
+        yield RuleFinding(RULE, f"{message}: {wrong}", evidence, where=timed.where)
+        return
+    yield from _find_wrong_clocks(records)
+
+
 def _find_wrong_clocks(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
     times = require_step_times(log)

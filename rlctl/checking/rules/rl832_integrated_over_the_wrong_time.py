@@ -10,6 +10,7 @@ from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import DeclaredTimes, NamedRate, find_declared, list_named_rates
+from rlctl.checking.timed_expressions import Use, find_wrong_time
 
 RULE = Rule(
     "RL832",
@@ -28,7 +29,18 @@ RULE = Rule(
 NEAR, ALONE = 0.1, 0.03  # relative errors of a time that is estimated; the same where no other one confirms it
 
 
-@judges_records(RULE, "attributes")
+@judges_records(RULE, "attributes", "expressions")
+def _judge(records: Records) -> Iterator[RuleFinding]:
+    for timed, times in find_wrong_time(records, Use.INTEGRATED):
+        often = "once" if timed.most == 1 else f"{timed.most} times"
+        message = f"{timed.text} is evaluated {often} in a step, with {timed.seconds:.3g} s: {timed.target} advances by"
+        message += f" {timed.total_s:.3g} s in a step that takes {times.control_s:.3g} s"
+        evidence = {"element": timed.target, "value": timed.total_s, "expected": times.control_s}
+        yield RuleFinding(RULE, message, evidence, where=timed.where)
+        return
+    yield from _find_wrong_integration(records)
+
+
 def _find_wrong_integration(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
     if np.isfinite(log.physics_s):

@@ -1,0 +1,59 @@
+"""The experiment `expressions`: plays short episodes and notes what the expressions of the source are worth, for rules
+that look at how numbers are computed."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiment import PROBE, JudgeHook, experiment
+from rlctl.checking.expressions import NotedCall, Source, record_expressions
+from rlctl.checking.instance import Context
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
+from rlctl.checking.rule import NotApplicable
+from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
+
+EPISODES = ("random", "zero", "extreme", "random", "rare")
+"""How the actions of each episode are chosen."""
+STEPS = 80  # of an episode
+MOST_NOTED = 300_000  # values; no episode begins after so many
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NotedEpisodes:
+    """The expressions of a source, and what was noted of them, by episodes and their calls: the reset, and steps."""
+
+    source: Source
+    episodes: Sequence[Sequence[NotedCall]]
+
+    @property
+    def steps(self) -> list[NotedCall]:
+        """The steps of all episodes."""
+        return [call for episode in self.episodes for call in episode[1:]]
+
+
+judges_expressions = JudgeHook[NotedEpisodes]()
+"""Shows the noted episodes of an instance."""
+
+
+@experiment("expressions", PROBE, 104, share=0.2, hooks=(judges_expressions,))
+def note_expressions(context: Context) -> Iterator[ChildMessage]:
+    """Play short episodes with functions that note their expressions."""
+    instance = context.instance
+    source = Source(instance.env)
+    if not source.expressions:
+        raise NotApplicable("its source is that of a library, or cannot be read")
+    episodes: list[list[NotedCall]] = []
+    with record_expressions(source) as recorder:
+        for number, kind in enumerate(EPISODES):
+            player = EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS)
+            with recorder.call(0) as noted:
+                player.reset()
+            episodes.append([noted])
+            while not player.ended:
+                with recorder.call(player.steps + 1) as noted:
+                    player.step()
+                episodes[-1].append(noted)
+            if recorder.total > MOST_NOTED or context.budget.is_over():
+                break
+    yield Fact(TIMED, find_timed_expressions(source, episodes))
+    yield from judges_expressions.judge(NotedEpisodes(source, episodes))
