@@ -27,7 +27,7 @@ NOTE = "__rlctl_note__"  # the name of the function that is called with each val
 MOST_MODULES, MOST_EVENTS = 20, 1_500_000
 Number = float | NDArray[np.float64]
 Value = Number | None  # None for what is no number and no small array of numbers
-Function = ast.FunctionDef | ast.AsyncFunctionDef
+Function = ast.FunctionDef
 _WITH_CONTEXT = ast.Name | ast.Attribute | ast.Subscript | ast.List | ast.Tuple
 
 
@@ -224,11 +224,11 @@ def _list_codes(code: CodeType) -> Iterator[CodeType]:
 
 def _walk_own(function: Function) -> Iterator[ast.AST]:
     """Yield the nodes of a function's statements, without those of functions and classes in it."""
-    waiting: list[ast.AST] = list(reversed(function.body))
+    waiting: list[ast.AST] = [*reversed(function.body)]
     while waiting:
         node = waiting.pop()
         yield node
-        if not isinstance(node, Function | ast.ClassDef):
+        if not isinstance(node, Function | ast.AsyncFunctionDef | ast.ClassDef):
             waiting += reversed(list(ast.iter_child_nodes(node)))
 
 
@@ -251,7 +251,9 @@ class _Noting(ast.NodeTransformer):
         self._is_inside = was_inside
         return node
 
-    visit_AsyncFunctionDef = visit_FunctionDef
+    def visit_AsyncFunctionDef(self, node: Any) -> Any:
+        """Leave it as it is: no environment is called so."""
+        return node
 
     def visit_ClassDef(self, node: ast.ClassDef) -> Any:
         """Change only the methods: a class may be made in a function."""
@@ -260,7 +262,7 @@ class _Noting(ast.NodeTransformer):
         self._is_inside = was_inside
         return node
 
-    def visit(self, node: ast.AST) -> Any:
+    def visit(self, node: Any) -> Any:
         """Change what is inside first."""
         if isinstance(node, ast.JoinedStr | ast.match_case | ast.Lambda):
             return node
@@ -274,7 +276,7 @@ class _Noting(ast.NodeTransformer):
         call = ast.Call(ast.Name(NOTE, ast.Load()), [ast.Constant(number), node], [])
         return ast.copy_location(call, node)
 
-    def _visit_parts(self, node: ast.AST) -> None:
+    def _visit_parts(self, node: Any) -> None:
         """Change the parts of a node; the owner of an attribute, and what is called, are no values of their own."""
         match node:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():

@@ -75,7 +75,7 @@ class _TermSource:
                 returned = [node.value for node in ast.walk(method) if isinstance(node, ast.Return)] if method else []
                 return follow(returned[0], method) if method and len(returned) == 1 and returned[0] else [UNKNOWN]
             case ast.Name(id=name):
-                assigned = _find_assigned(function, name)
+                assigned = find_assigned(function, name)
                 if assigned:
                     return follow(assigned[0]) if len(assigned) == 1 else [UNKNOWN]
                 return [self._read_number(value)]
@@ -100,7 +100,7 @@ class _TermSource:
                 case ast.Name(id=name, ctx=ast.Load()) if name in {"action", "actions"}:
                     found = True
                 case ast.Name(id=name, ctx=ast.Load()):
-                    parts = [(assigned, function) for assigned in _find_assigned(function, name)]
+                    parts = [(assigned, function) for assigned in find_assigned(function, name)]
                 case ast.Attribute(value=ast.Name(id="self"), attr=name, ctx=ast.Load()):
                     parts = self._list_sources(name)
             for part, inside in parts if depth < SHALLOW else ():
@@ -208,7 +208,7 @@ def _read_entries(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
                     yield keyword.arg, keyword.value
 
 
-def _find_assigned(function: ast.FunctionDef, name: str) -> list[ast.expr]:
+def find_assigned(function: ast.FunctionDef, name: str) -> list[ast.expr]:
     """Return what a function assigns to a local name."""
     found = []
     for node in ast.walk(function):

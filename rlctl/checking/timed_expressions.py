@@ -5,6 +5,7 @@ import collections
 import contextlib
 import dataclasses
 import enum
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -14,8 +15,9 @@ from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.expressions import Expression, NotedCall, Source, Value
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable
-from rlctl.checking.step_times import StepTimes, require_step_times
+from rlctl.checking.step_times import SUBSTEP_WORDS, StepTimes, require_step_times
 from rlctl.checking.term_names import split_name
+from rlctl.checking.term_weights import find_assigned
 
 TIME_WORDS = {"dt", "timestep", "h", "ts"}
 RATE_WORDS = {"hz", "freq", "frequency", "fps", "rate"}
@@ -67,7 +69,9 @@ def find_wrong_time(records: Records, use: Use) -> Iterator[tuple[TimedExpressio
     if log is not None:
         with contextlib.suppress(NotApplicable):
             times = require_step_times(log)
-    for one in timed if times is not None else ():
+    if times is None:
+        return
+    for one in timed:
         if one.use == use and one.is_wrong(times):
             yield one, times
             return
@@ -109,7 +113,8 @@ def _find_added(
     for one in source.expressions:
         statement = source.parents.get(one.node)
         if isinstance(statement, ast.AugAssign) and isinstance(statement.op, ast.Add | ast.Sub):
-            target, added = statement.target, one.node
+            target: ast.expr = statement.target
+            added = one.node
         else:
             found = _read_sum(source, one.node)
             if found is None:
@@ -118,8 +123,10 @@ def _find_added(
         if _is_of_loop(target, one):
             continue
         for summand in _list_summands(added):
-            factors = _list_factors(summand)
-            times = [(factor, seconds) for factor in factors if (seconds := _read_time(factor, constants)) is not None]
+            factors = _list_factors(summand, one)
+            times = [
+                (factor, seconds) for factor in factors if (seconds := _read_time(factor, one, constants)) is not None
+            ]
             if len(times) == 1:
                 is_clock = all(factor in constants or isinstance(factor, ast.Constant) for factor in factors)
                 use = Use.COUNTED if is_clock else Use.INTEGRATED
@@ -144,12 +151,14 @@ def _read_sum(source: Source, node: ast.expr) -> tuple[ast.expr, ast.expr] | Non
 
 def _is_of_loop(target: ast.expr, one: Expression) -> bool:
     """Say whether a target belongs to what a loop goes through: each is added to once."""
-    root = target
-    while isinstance(root, ast.Attribute | ast.Subscript):
-        root = root.value
-    loops = [node for node in ast.walk(one.function) if isinstance(node, ast.For)]
-    names = {node.id for loop in loops for node in ast.walk(loop.target) if isinstance(node, ast.Name)}
-    return isinstance(root, ast.Name) and root.id in names
+    match target:
+        case ast.Attribute(value=owner) | ast.Subscript(value=owner):
+            return _is_of_loop(owner, one)
+        case ast.Name(id=name):
+            loops = [node for node in ast.walk(one.function) if isinstance(node, ast.For)]
+            parts = [part for loop in loops for part in ast.walk(loop.target)]
+            return any(isinstance(part, ast.Name) and part.id == name for part in parts)
+    return False
 
 
 def _list_summands(node: ast.expr) -> Iterator[ast.expr]:
@@ -162,40 +171,49 @@ def _list_summands(node: ast.expr) -> Iterator[ast.expr]:
         yield node
 
 
-def _list_factors(node: ast.expr) -> list[ast.expr]:
+def _list_factors(node: ast.expr, one: Expression) -> list[ast.expr]:
     """Return the factors of a product, also those of what is divided."""
     match node:
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return _list_factors(left) + _list_factors(right)
-        case ast.BinOp(left=ast.Constant(), op=ast.Div()):
-            return [node]
-        case ast.BinOp(left=left, op=ast.Div(), right=right) if _is_count(right) and _is_named_time(left):
-            return [node]
-        case ast.BinOp(left=left, op=ast.Div(), right=right):
-            return [*_list_factors(left), right] if _list_factors(left) else [node]
+            return _list_factors(left, one) + _list_factors(right, one)
+        case ast.BinOp(op=ast.Div(), left=left, right=right) if not _is_named_time(node, one):
+            return [*_list_factors(left, one), right]
         case ast.Call(func=ast.Name(id="float"), args=[only]):
-            return _list_factors(only)
+            return _list_factors(only, one)
     return [node]
 
 
-def _read_time(node: ast.expr, constants: Mapping[ast.expr, float]) -> float | None:
-    """Return the time that an expression is, by what it is called [s]; None for anything else."""
+def _read_time(node: ast.expr, one: Expression, constants: Mapping[ast.expr, float]) -> float | None:
+    """Return the time that a part of an expression is, by what it is called [s]; None for anything else."""
     value = constants.get(node)
-    return value if value is not None and value > 0 and _is_named_time(node) else None
+    return value if value is not None and value > 0 and _is_named_time(node, one) else None
 
 
-def _is_named_time(node: ast.expr) -> bool:
+def _is_named_time(node: ast.expr, one: Expression) -> bool:
+    """Say whether names say that a part of an expression is a time: `dt`, `dt / substeps`, `1 / 240`, `1 / rate_hz`."""
     match node:
         case ast.BinOp(left=ast.Constant(), op=ast.Div(), right=right):
             return bool(_words(right) & RATE_WORDS) or isinstance(right, ast.Constant)
-        case ast.BinOp(left=left, op=ast.Div() | ast.Mult(), right=right):
-            return _is_named_time(left) or _is_named_time(right)
+        case ast.BinOp(left=left, op=ast.Div(), right=right):
+            return _is_named_time(left, one) and _is_count(right, one)
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            return any(_is_named_time(a, one) and _is_count(b, one) for a, b in ((left, right), (right, left)))
+        case ast.Name(id=name):
+            assigned = find_assigned(one.function, name)
+            if len(assigned) == 1 and _is_named_time(assigned[0], one):
+                return True
     words = _words(node)
     return bool(words & TIME_WORDS) or words >= {"time", "step"}
 
 
-def _is_count(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant | ast.Name | ast.Attribute) and not _is_named_time(node)
+def _is_count(node: ast.expr, one: Expression) -> bool:
+    """Say whether a part of an expression is how often something is repeated."""
+    match node:
+        case ast.Constant(value=int()):
+            return True
+        case ast.Call(func=ast.Name(id="int" | "float"), args=[only]):
+            return _is_count(only, one)
+    return bool(_words(node) & SUBSTEP_WORDS)
 
 
 def _words(node: ast.expr) -> set[str]:
@@ -226,7 +244,7 @@ def _find_divided(
     for one in source.expressions:
         match one.node:
             case ast.BinOp(left=left, op=ast.Div(), right=right):
-                seconds = _read_time(right, constants)
+                seconds = _read_time(right, one, constants)
             case _:
                 continue
         differences = [source.find(node) for node in ast.walk(left) if _is_difference(node)]
@@ -253,7 +271,7 @@ def spans_steps(source: Source, difference: Expression, steps: Sequence[NotedCal
     rows = [[call.values.get(number, [None])[0] for number in numbers] for call in steps]
     for new, old in ((0, 1), (1, 0)):
         same, moving = 0, 0
-        for before, row in zip(rows, rows[1:], strict=False):
+        for before, row in itertools.pairwise(rows):
             if _differ(row[new], row[old]):
                 moving += 1
                 same += not _differ(before[new], row[old])
