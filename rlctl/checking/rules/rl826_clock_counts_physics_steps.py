@@ -21,10 +21,12 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A clock that each step advances runs with the time of one step of the physics, or counts the steps of the
-        physics as if each was a whole step: the phase of a gait whose period is declared, a time in seconds, passed or
+        physics as if each was a whole step: a line of the source adds the one time where the other is meant, or it
+        shows in what is observed. It is the phase of a gait whose period is declared, a time in seconds, passed or
         left, a time feature of the observation, or the time limit. All of them are then wrong by the number of physics
         steps in a step. Times are those of the engine; in a robot without an engine they are what it declares, as `dt`
-        and `substeps` or by a loop of its step, and what its positions and velocities confirm.
+        and `substeps` or by a loop of its step, and what its positions and velocities confirm, or those on which most lines
+        that add up times agree.
     """,
     fix="""
         Advance the clock once in each step, by the time between two actions: the physics step times frame_skip, which
