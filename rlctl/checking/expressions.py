@@ -96,6 +96,12 @@ class Source:
             node = self.parents[node]
         return node
 
+    def find_function(self, node: ast.AST) -> Function:
+        """Return the innermost function around a node."""
+        while not isinstance(node, Function):
+            node = self.parents[node]
+        return node
+
 
 @dataclasses.dataclass(eq=False)
 class NotedCall:

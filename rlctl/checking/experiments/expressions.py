@@ -2,12 +2,13 @@
 that look at how numbers are computed."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
-from rlctl.checking.expressions import NotedCall, Source, record_expressions
-from rlctl.checking.instance import Context
+from rlctl.checking.expressions import ExpressionRecorder, NotedCall, Source, record_expressions
+from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
@@ -24,6 +25,26 @@ class NotedEpisodes:
 
     source: Source
     episodes: Sequence[Sequence[NotedCall]]
+    context: Context
+    recorder: ExpressionRecorder
+
+    def play(self, number: int, steps: int, forced: Mapping[int, Mapping[int, Any]]) -> list[tuple[NotedCall, Moment]]:
+        """Play an episode again for some steps, in which expressions are worth what is given, by steps and by their
+        numbers. It ends where the environment raises an exception: what is forced may lead anywhere."""
+        kind = EPISODES[number]
+        player = EpisodePlayer(self.context.instance, FIRST_SEED + number, kind, number=number, max_steps=steps)
+        played: list[tuple[NotedCall, Moment]] = []
+        try:
+            while not player.ended or not played:
+                self.recorder.forced = dict(forced.get(len(played), {}))
+                with self.recorder.call(len(played)) as noted:
+                    moment = player.step() if played else player.reset()
+                played.append((noted, moment))
+        except EnvironmentRaised:
+            pass
+        finally:
+            self.recorder.forced = {}
+        return played
 
     @property
     def steps(self) -> list[NotedCall]:
@@ -55,5 +76,5 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
                 episodes[-1].append(noted)
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
-    yield Fact(TIMED, find_timed_expressions(source, episodes))
-    yield from judges_expressions.judge(NotedEpisodes(source, episodes))
+        yield Fact(TIMED, find_timed_expressions(source, episodes))
+        yield from judges_expressions.judge(NotedEpisodes(source, episodes, context, recorder))
