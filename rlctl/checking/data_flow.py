@@ -3,7 +3,7 @@
 import ast
 import collections
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from rlctl.checking.expressions import Function, Source
 from rlctl.checking.term_names import split_name
@@ -24,15 +24,21 @@ class Assignment:
 
 
 class DataFlow:
-    """Follows names and attributes of a source, without regard to which object has them."""
+    """Follows names and attributes of a source, without regard to which object has them. Classes of which `is_used` is
+    not true are left out."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, is_used: Callable[[ast.ClassDef], bool]) -> None:
         self.source = source
-        self.all_functions = [function for named in source.functions.values() for function in named]
+        self.functions = collections.defaultdict[str, list[Function]](list)
+        for named in source.functions.values():
+            for function in named:
+                owner = source.parents[function]
+                if not isinstance(owner, ast.ClassDef) or is_used(owner):
+                    self.functions[function.name].append(function)
         self.assigned = collections.defaultdict[str, list[Assignment]](list)
         self._locals = collections.defaultdict[tuple[Function, str], list[ast.expr | None]](list)
         self.calls = collections.defaultdict[str, list[tuple[ast.Call, Function]]](list)
-        for function in self.all_functions:
+        for function in [function for named in self.functions.values() for function in named]:
             for node in ast.walk(function):
                 self._read(node, function)
 
@@ -85,7 +91,7 @@ class DataFlow:
     def _find_arguments(self, name: str, function: Function) -> list[tuple[ast.expr, Function]]:
         """Return what a parameter is in the calls of its function."""
         names = [one.arg for one in function.args.posonlyargs + function.args.args]
-        if name not in names or len(self.source.functions[function.name]) > 1:
+        if name not in names or len(self.functions.get(function.name, ())) > 1:
             return []
         found = []
         for call, caller in self.calls[function.name]:
@@ -129,7 +135,7 @@ class DataFlow:
                 case ast.AugAssign(target=target) | ast.AnnAssign(target=target):
                     found |= {key} if (key := read_key(target)) else set()
                 case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if depth:
-                    for inner in self.source.functions.get(name, ()):
+                    for inner in self.functions.get(name, ()):
                         found |= self.list_sets(inner, depth - 1)
         return found
 
@@ -137,10 +143,10 @@ class DataFlow:
         match node:
             case ast.Name(id=name):
                 yield from ((value, function) for value in self.list_definitions(name, function))
-                if function.name in self.source.functions and not self._locals.get((function, name)):
+                if function.name in self.functions and not self._locals.get((function, name)):
                     yield from self._find_arguments(name, function)
             case ast.Attribute(attr=name) | ast.Call(func=ast.Name(id=name)):
-                for inner in self.source.functions.get(name, ()):
+                for inner in self.functions.get(name, ()):
                     yield inner, inner
 
     def list_conditions(self, node: ast.AST) -> list[tuple[ast.expr, bool]]:

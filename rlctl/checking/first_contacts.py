@@ -28,7 +28,7 @@ class EndlessLanding:
 
 def find_endless_landings(noted: NotedEpisodes) -> Iterator[EndlessLanding]:
     """Yield conditions `contact and time > 0` that hold in each step of contact."""
-    flow = DataFlow(noted.source)
+    flow = DataFlow(noted.source, noted.is_used)
     for contact, comparison, time, key in _list_conditions(noted, flow):
         stays: list[float] = []
         for episode in noted.episodes:

@@ -13,6 +13,7 @@ from rlctl.checking.expressions import Expression, Function, NotedCall, Value
 from rlctl.checking.previous_values import KeptDifference, KeptDifferences, is_goal, is_previous_key
 from rlctl.checking.timed_expressions import spans_steps
 
+FEW_STEPS = 5
 BEFORE = 6  # steps before a new goal comes
 JUMP, USUAL = 3.0, 0.95  # times as large as this quantile of the differences in other steps
 NEEDED = 2  # episodes in which it jumps
@@ -50,7 +51,9 @@ class GoalDraws:
     def find_jumps(self) -> Iterator[GoalJump]:
         """Yield differences that jump in the step after a new goal, and are paid."""
         for one in self.kept.differences:
-            is_kept = is_previous_key(one.key) or spans_steps(self.noted.source, one.whole, self.noted.steps)
+            is_kept = is_previous_key(one.key) or (
+                isinstance(one.whole.node, ast.BinOp) and spans_steps(self.noted.source, one.whole, self.noted.steps)
+            )
             for branch in self._list_branches(one) if is_kept else ():
                 found = self._try(one, branch)
                 if found is not None:
@@ -63,7 +66,7 @@ class GoalDraws:
             for key in sorted(self.flow.list_reads(one.new.node, one.whole.function) & self.flow.assigned.keys())
             if not self._adds_up(one, key)
             for assignment in self.flow.assigned[key]
-            if is_goal(key) or _counts(assignment) or self._draws(assignment)
+            if is_goal(key) or _counts(assignment) or self._draws(assignment) or self._takes_next(assignment)
             for tests in self._list_tests(assignment)
         )
         return list(branches)[:MOST_BRANCHES]
@@ -98,6 +101,16 @@ class GoalDraws:
         sources = [top for top, _ in self.flow.list_sources(node, function)]
         return not any(isinstance(inner, ast.Sub) for top in sources for inner in ast.walk(top))
 
+    def _takes_next(self, assignment: Assignment) -> bool:
+        """Say whether an assignment takes from a list what a counter says."""
+        match peel(assignment.value):
+            case ast.Call(func=ast.Attribute(attr="pop" | "popleft") | ast.Name(id="next")):
+                return True
+            case ast.Subscript(slice=index):
+                keys = self.flow.list_reads(index, assignment.function)
+                return any(_counts(one) for key in keys for one in self.flow.assigned.get(key, ()))
+        return False
+
     def _draws(self, assignment: Assignment) -> bool:
         tops = [top for top, _ in self.flow.list_sources(assignment.value, assignment.function)]
         calls = [node for top in tops for node in ast.walk(top) if isinstance(node, ast.Call)]
@@ -109,11 +122,26 @@ class GoalDraws:
 
     def _list_tests(self, assignment: Assignment) -> Iterator[tuple[tuple[int, bool], ...]]:
         """Yield what tests have to be for an assignment to be reached in a step; nothing where it always is."""
-        for conditions in self._list_paths(assignment.statement, assignment.function, MOST_DEEP):
+        for path in self._list_paths(assignment.statement, assignment.function, MOST_DEEP):
+            conditions = [*self._list_choices(assignment), *path]
             tests = [(self.noted.source.find(test), is_met) for test, is_met in conditions]
             known = tuple((test.number, is_met) for test, is_met in tests if test is not None)
             if known and len(known) == len(tests) and known[-1][0] in self._evaluated:
                 yield known
+
+    def _list_choices(self, assignment: Assignment) -> Iterator[tuple[ast.expr, bool]]:
+        """Yield masks of the worlds that an assignment is for: `goal[mask] = ...`, `np.where(mask, ..., goal)`."""
+        choices = [assignment.target.slice] if isinstance(assignment.target, ast.Subscript) else []
+        choices += [
+            node.args[0]
+            for node in ast.walk(assignment.value)
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "where"
+            if node.args
+        ]
+        for choice in choices:
+            noted = self.noted.source.find(choice)
+            if noted is not None and any(self._list_masks(noted)):
+                yield choice, True
 
     def _list_paths(self, node: ast.AST, function: Function, depth: int) -> Iterator[list[tuple[ast.expr, bool]]]:
         """Yield the conditions of a node from the innermost to the outermost, by each way that leads to it."""
@@ -162,13 +190,10 @@ class GoalDraws:
                 if isinstance(origin, ast.Call) and origin.args:  # np.flatnonzero(mask)
                     origin, _ = self.flow.resolve(peel(origin.args[0]), test.function)
                 mask = self.noted.source.find(origin)
-                values = (
-                    [value for call in self.noted.steps[:5] for value in call.values.get(mask.number, [])]
-                    if mask
-                    else []
-                )
+                calls = self.noted.steps[:FEW_STEPS] if mask else []
+                values = [value for call in calls for value in call.values.get(mask.number, [])]
                 if mask and values and all(_is_mask(value) for value in values):
-                    yield mask.number, np.ones(np.shape(values[0]), np.bool_)
+                    yield mask.number, np.ones_like(values[0], np.bool_)
 
 
 def _is_mask(value: Value) -> bool:

@@ -47,7 +47,7 @@ class KeptDifferences:
     """Those of a source, and the judgements of them."""
 
     def __init__(self, noted: NotedEpisodes) -> None:
-        self.noted, self.flow = noted, DataFlow(noted.source)
+        self.noted, self.flow = noted, DataFlow(noted.source, noted.is_used)
         self.differences = [one for expression in noted.source.expressions for one in self._read(expression)]
 
     def _read(self, whole: Expression) -> Iterator[KeptDifference]:

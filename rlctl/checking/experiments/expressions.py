@@ -1,7 +1,9 @@
 """The experiment `expressions`: plays short episodes and notes what the expressions of the source are worth, for rules
 that look at how numbers are computed."""
 
+import ast
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +14,7 @@ from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
+from rlctl.checking.values import find_author, list_own_classes
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
@@ -45,6 +48,19 @@ class NotedEpisodes:
         finally:
             self.recorder.forced = {}
         return played
+
+    def is_used(self, cls: ast.ClassDef) -> bool:
+        """Say whether a class is one of the environment, or does something in its episodes."""
+        return cls.name in self._own_names or any(node in self._evaluated for node in cls.body)
+
+    @functools.cached_property
+    def _own_names(self) -> set[str]:
+        return {own.__name__ for own in list_own_classes(find_author(self.context.instance.env))}
+
+    @functools.cached_property
+    def _evaluated(self) -> set[ast.AST]:
+        calls = [call for episode in self.episodes for call in episode]
+        return {self.source.expressions[number].function for call in calls for number in call.values}
 
     @property
     def steps(self) -> list[NotedCall]:
