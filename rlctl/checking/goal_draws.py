@@ -35,7 +35,7 @@ class GoalJump:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Branch:
+class Branch:
     """How a goal comes to be set in a step: what tests have to be, by their numbers."""
 
     key: str
@@ -54,22 +54,24 @@ class GoalDraws:
             is_kept = is_previous_key(one.key) or (
                 isinstance(one.whole.node, ast.BinOp) and spans_steps(self.noted.source, one.whole, self.noted.steps)
             )
-            for branch in self._list_branches(one) if is_kept else ():
+            for branch in self.list_branches(one) if is_kept else ():
                 found = self._try(one, branch)
                 if found is not None:
                     yield found
                     break
 
-    def _list_branches(self, one: KeptDifference) -> list[_Branch]:
-        branches = dict.fromkeys(
-            _Branch(key, tests)
-            for key in sorted(self.flow.list_reads(one.new.node, one.whole.function) & self.flow.assigned.keys())
-            if not self._adds_up(one, key)
-            for assignment in self.flow.assigned[key]
-            if is_goal(key) or _counts(assignment) or self._draws(assignment) or self._takes_next(assignment)
-            for tests in self._list_tests(assignment)
-        )
-        return list(branches)[:MOST_BRANCHES]
+    def list_branches(self, one: KeptDifference) -> list[Branch]:
+        keys = sorted(self.flow.list_reads(one.new.node, one.whole.function) & self.flow.assigned.keys())
+        goals = [(key, assignment) for key in keys for assignment in self.flow.assigned[key]]
+        goals = [(key, assignment) for key, assignment in goals if self.is_new_goal(key, assignment)]
+        if any(self._adds_up(one, key) for key in {key for key, _ in goals}):
+            return []
+        branches = [Branch(key, tests) for key, assignment in goals for tests in self.list_tests(assignment)]
+        return list(dict.fromkeys(branches))[:MOST_BRANCHES]
+
+    def is_new_goal(self, key: str, assignment: Assignment) -> bool:
+        is_next = _counts(assignment) or self._takes_next(assignment)
+        return is_goal(key) or is_next or self._draws(assignment)
 
     def _adds_up(self, one: KeptDifference, key: str) -> bool:
         """Say whether the new value has the rest of the way behind the next goal: it then goes on without a jump."""
@@ -120,7 +122,7 @@ class GoalDraws:
     def _evaluated(self) -> set[int]:
         return {number for call in self.noted.steps for number in call.values}
 
-    def _list_tests(self, assignment: Assignment) -> Iterator[tuple[tuple[int, bool], ...]]:
+    def list_tests(self, assignment: Assignment) -> Iterator[tuple[tuple[int, bool], ...]]:
         """Yield what tests have to be for an assignment to be reached in a step; nothing where it always is."""
         for path in self._list_paths(assignment.statement, assignment.function, MOST_DEEP):
             conditions = [*self._list_choices(assignment), *path]
@@ -155,7 +157,7 @@ class GoalDraws:
             if caller is not function and function.name != "step":
                 yield from (inner + rest for rest in self._list_paths(call, caller, depth - 1))
 
-    def _try(self, one: KeptDifference, branch: _Branch) -> GoalJump | None:
+    def _try(self, one: KeptDifference, branch: Branch) -> GoalJump | None:
         sizes = [size for episode in self.noted.episodes for size in _sizes(one, episode[1:])]
         usual = float(np.quantile(sizes, USUAL)) if sizes else 0.0
         jumps: list[float] = []
@@ -163,7 +165,7 @@ class GoalDraws:
             step = min(BEFORE, len(episode) - 2)
             if step < 1 or not usual:
                 continue
-            forced = {step: self._force(branch)}
+            forced = {step: self.force(branch)}
             played = self.noted.play(number, step + 1, forced)
             if len(played) < step + 2:
                 continue
@@ -171,11 +173,13 @@ class GoalDraws:
             if after > JUMP * max(usual, before) and self.kept.is_paid_at(one, number, step + 1, forced):
                 jumps.append(after)
             if len(jumps) == NEEDED:
-                test = self.noted.source.expressions[branch.tests[-1][0]].text
-                return GoalJump(one, branch.key, test, max(jumps), usual, len(jumps))
+                met = [number for number, is_met in branch.tests if is_met] or [branch.tests[-1][0]]
+                return GoalJump(
+                    one, branch.key, self.noted.source.expressions[met[0]].text, max(jumps), usual, len(jumps)
+                )
         return None
 
-    def _force(self, branch: _Branch) -> dict[int, Any]:
+    def force(self, branch: Branch) -> dict[int, Any]:
         """Return what expressions are to be worth: the tests, and masks of worlds that these are computed from."""
         forced: dict[int, Any] = {}
         for number, is_met in branch.tests:

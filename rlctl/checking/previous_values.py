@@ -78,7 +78,7 @@ class KeptDifferences:
         """Say whether a step replaces what is kept by a copy of the new value."""
         for assignment in self.flow.assigned[one.key]:
             origin, _ = self.flow.resolve(assignment.value, assignment.function)
-            if assignment.function in self._of_steps and ast.unparse(origin) == ast.unparse(one.origin):
+            if assignment.function in self.of_steps and ast.unparse(origin) == ast.unparse(one.origin):
                 return True
         return False
 
@@ -101,11 +101,11 @@ class KeptDifferences:
     def _may_be_replaced(self, one: KeptDifference) -> bool:
         """Say whether code of a step replaces what is kept, other than where a new goal comes."""
         return any(
-            assignment.function in self._of_steps and not self._comes_with_goal(assignment)
+            assignment.function in self.of_steps and not self.comes_with_goal(assignment)
             for assignment in self.flow.assigned[one.key]
         )
 
-    def _comes_with_goal(self, assignment: Assignment) -> bool:
+    def comes_with_goal(self, assignment: Assignment) -> bool:
         """Say whether an assignment stands under an `if`, or in a function, that also sets a goal."""
         conditions = self.flow.list_conditions(assignment.statement)
         blocks: list[Sequence[ast.AST]] = [] if conditions else [assignment.function.body]
@@ -117,7 +117,7 @@ class KeptDifferences:
         return any(is_goal(key) for block in blocks for node in block for key in self.flow.list_sets(node))
 
     @functools.cached_property
-    def _of_steps(self) -> set[ast.AST]:
+    def of_steps(self) -> set[ast.AST]:
         """The functions that steps run."""
         expressions = self.noted.source.expressions
         return {expressions[number].function for call in self.noted.steps for number in call.values}

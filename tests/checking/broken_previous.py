@@ -267,3 +267,83 @@ class RL628BoatPaddlesAtOnceInEachStep(BoatPaddles):
         paid = np.sum((self.air - 0.1) * np.logical_and(was_up, wet))
         self.air *= ~wet
         return float(paid) - self.distance()
+
+
+class BoatStays(Boat):
+    """It has to stay at its buoy for three steps."""
+
+    def start(self):
+        super().start()
+        self.steps_held = 0
+
+    def is_success(self):
+        if self.distance() < 0.3:
+            self.steps_held += 1
+        else:
+            self.steps_held = 0
+        return self.steps_held >= 3
+
+
+class RL641BoatStaysNowAndThen(BoatStays):
+    def is_success(self):
+        if self.distance() < 0.3:
+            self.steps_held += 1
+        return self.steps_held >= 3
+
+
+class BoatStaysMasked(BoatStays):
+    """The same with an array."""
+
+    def start(self):
+        super().start()
+        self.hold_s = np.zeros(1)
+
+    def is_success(self):
+        inside = np.array([self.distance()]) < 0.3
+        self.hold_s = (self.hold_s + 0.1) * inside
+        return bool((self.hold_s >= 0.3)[0])
+
+
+class RL641BoatStaysMaskedNowAndThen(BoatStaysMasked):
+    def is_success(self):
+        inside = np.array([self.distance()]) < 0.3
+        self.hold_s = self.hold_s + np.where(inside, 0.1, 0.0)
+        return bool((self.hold_s >= 0.3)[0])
+
+
+class BoatOnCommand(Boat):
+    """It is to sail at a speed, which changes every 20 steps."""
+
+    def start(self):
+        super().start()
+        self.draw_command()
+        self.shown = self.command
+
+    def draw_command(self):
+        self.command = self.np_random.uniform(-0.5, 0.5, 2)
+
+    def size(self):
+        return 8
+
+    def observe(self):
+        return np.concatenate([super().observe(), self.get_shown()]).astype(np.float32)
+
+    def get_shown(self):
+        return self.command
+
+    def is_success(self):
+        return False
+
+    def info(self, _):
+        return {"is_success": bool(np.abs(self.speed - self.command).max() < 0.1)}
+
+    def reward(self):
+        paid = -float(np.abs(self.speed - self.command).sum())
+        if self.steps % 20 == 0:
+            self.draw_command()
+        return paid
+
+
+class RL638BoatOnCommandShowsTheFirst(BoatOnCommand):
+    def get_shown(self):
+        return self.shown
