@@ -194,10 +194,11 @@ class GoalDraws:
                 if isinstance(origin, ast.Call) and origin.args:  # np.flatnonzero(mask)
                     origin, _ = self.flow.resolve(peel(origin.args[0]), test.function)
                 mask = self.noted.source.find(origin)
-                calls = self.noted.steps[:FEW_STEPS] if mask else []
-                values = [value for call in calls for value in call.values.get(mask.number, [])]
-                if mask and values and all(_is_mask(value) for value in values):
-                    yield mask.number, np.ones_like(values[0], np.bool_)
+                if mask is None:
+                    continue
+                values = [value for call in self.noted.steps[:FEW_STEPS] for value in call.values.get(mask.number, [])]
+                if values and all(_is_mask(value) for value in values):
+                    yield mask.number, np.ones(np.shape(np.asarray(values[0])), np.bool_)
 
 
 def _is_mask(value: Value) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rlctl.checking.data_flow import Assignment, read_key, read_words
 from rlctl.checking.expressions import Expression, NotedCall, Value
-from rlctl.checking.goal_draws import BEFORE, OUTER, Branch, GoalDraws
+from rlctl.checking.goal_draws import BEFORE, Branch, GoalDraws
 from rlctl.checking.previous_values import is_previous_key
 
 FIRST_WORDS = {
@@ -40,12 +40,12 @@ class StaleValues:
         self.draws, self.flow, self.noted, self.kept = draws, draws.flow, draws.noted, draws.kept
 
     def find_stale_copies(self) -> Iterator[StaleCopy]:
-        """Yield copies that only reset makes, of goals that steps change: afterwards both are read."""
+        """Yield copies that no step makes, of goals that steps change: afterwards both are read."""
         for key, assignments in self.flow.assigned.items():
-            goals = {self._read_copied(one) for one in assignments if one.function.name in OUTER}
+            goals = {self._read_copied(one) for one in assignments}
             goal = goals.pop() if len(goals) == 1 else ""
             is_meant = {*read_words(key)} & FIRST_WORDS or is_previous_key(key) or key[-1].isdigit()
-            is_set = any(one.function.name not in {*OUTER} for one in assignments)
+            is_set = any(one.function in self.kept.of_steps for one in assignments)
             if not goal or goal == key or is_meant or is_set:
                 continue
             for one in self.flow.assigned.get(goal, ()):
