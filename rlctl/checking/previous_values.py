@@ -12,7 +12,7 @@ import numpy as np
 from rlctl.checking.data_flow import Assignment, DataFlow, read_key, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Expression, NotedCall, Value
-from rlctl.checking.term_names import PLACE_WORDS, is_place, split_name
+from rlctl.checking.term_names import ERROR_WORDS, is_place, split_name
 
 PREVIOUS_WORDS = {"before", "former", "last", "old", "prev", "previous", "prior", "past"}
 TIME_NAMES = {"t", "time", "step", "steps", "clock", "count", "counter", "tick", "ticks", "elapsed"}
@@ -21,6 +21,19 @@ GOAL_NAMES = {
     "destination", "setpoint", "station", "wp", "next", "current", "which", "active", "reference", "ref", "spot",
     "course", "lap",
 }  # fmt: skip
+SIZE_WORDS = {
+    "angle",
+    "bearing",
+    "cost",
+    "gap",
+    "heading",
+    "potential",
+    "progress",
+    "range",
+    "reward",
+    "score",
+    "speed",
+}
 MOST_REPLACED = 0.1  # part of the steps in which new goals come
 FEWEST_CHANGES = 20  # steps in which the new value is another one than before
 ZERO = 1e-6  # part of the changes of the new value
@@ -142,13 +155,17 @@ class KeptDifferences:
 
 
 def is_previous_key(key: str) -> bool:
-    """Say whether a key names what was before. The last goal is the end of a course."""
-    return any({*split_name(name)} & PREVIOUS_WORDS and not is_place(name) for name in key.split("."))
+    """Say whether a key names what was before. The last goal is the end of a course; the last distance to it is not."""
+    return any({*split_name(name)} & PREVIOUS_WORDS and not _is_goal_itself(name) for name in key.split("."))
 
 
 def is_goal(key: str) -> bool:
     """Say whether a key names a goal, or which one it is."""
-    return bool({*split_name(key)} & (PLACE_WORDS | GOAL_NAMES)) and not is_previous_key(key)
+    return bool({*split_name(key)} & GOAL_NAMES or _is_goal_itself(key)) and not is_previous_key(key)
+
+
+def _is_goal_itself(name: str) -> bool:
+    return is_place(name) and not {*split_name(name)} & (ERROR_WORDS | SIZE_WORDS)
 
 
 def _read_sides(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:

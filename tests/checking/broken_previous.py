@@ -14,16 +14,16 @@ class BoatAhead(Boat):
 
     def start(self):
         super().start()
-        self.prev_distance = self.distance()
+        self.previous_distance_to_goal = self.distance()
 
     def reward(self):
         distance = self.distance()
-        progress = gain(self.prev_distance, distance)
+        progress = gain(self.previous_distance_to_goal, distance)
         self.keep(distance)
         return progress
 
     def keep(self, distance):
-        self.prev_distance = distance
+        self.previous_distance_to_goal = distance
 
 
 class RL637BoatAheadFromTheStart(BoatAhead):

@@ -11,6 +11,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.expressions import ExpressionRecorder, NotedCall, Source, record_expressions
 from rlctl.checking.instance import Context, EnvironmentRaised
+from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
@@ -19,6 +20,7 @@ from rlctl.checking.values import find_author, list_own_classes
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
+LONGEST_S = 10.0  # for episodes that are played again [s]
 MOST_NOTED = 300_000  # values; no episode begins after so many
 
 
@@ -30,11 +32,16 @@ class NotedEpisodes:
     episodes: Sequence[Sequence[NotedCall]]
     context: Context
     recorder: ExpressionRecorder
+    _times: list[float] = dataclasses.field(default_factory=list)  # of what was played again [s]
 
     def play(self, number: int, steps: int, forced: Mapping[int, Mapping[int, Any]]) -> list[tuple[NotedCall, Moment]]:
         """Play an episode again for some steps, in which expressions are worth what is given, by steps and by their
-        numbers. It ends where the environment raises an exception: what is forced may lead anywhere."""
+        numbers. It ends where the environment raises an exception: what is forced may lead anywhere. Nothing is played
+        where it took too long already."""
         kind = EPISODES[number]
+        began = read_clock()
+        if sum(self._times) > LONGEST_S:
+            return []
         player = EpisodePlayer(self.context.instance, FIRST_SEED + number, kind, number=number, max_steps=steps)
         played: list[tuple[NotedCall, Moment]] = []
         try:
@@ -47,6 +54,7 @@ class NotedEpisodes:
             pass
         finally:
             self.recorder.forced = {}
+            self._times.append(read_clock() - began)
         return played
 
     def is_used(self, cls: ast.ClassDef) -> bool:
