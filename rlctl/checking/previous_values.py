@@ -172,7 +172,7 @@ def _read_sides(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
     match node:
         case ast.BinOp(left=left, op=ast.Sub(), right=right):
             return left, right
-        case ast.Call(func=ast.Attribute(attr="subtract"), args=[left, right]):
+        case ast.Call(func=ast.Attribute(attr="subtract" | "change" | "difference"), args=[left, right]):
             return left, right
     return None
 
