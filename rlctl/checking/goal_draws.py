@@ -61,6 +61,7 @@ class GoalDraws:
                     break
 
     def list_branches(self, one: KeptDifference) -> list[Branch]:
+        """Return the branches in which a step sets a goal that a difference depends on."""
         keys = sorted(self.flow.list_reads(one.new.node, one.whole.function) & self.flow.assigned.keys())
         goals = [(key, assignment) for key in keys for assignment in self.flow.assigned[key]]
         goals = [(key, assignment) for key, assignment in goals if self.is_new_goal(key, assignment)]
@@ -70,6 +71,7 @@ class GoalDraws:
         return list(dict.fromkeys(branches))[:MOST_BRANCHES]
 
     def is_new_goal(self, key: str, assignment: Assignment) -> bool:
+        """Say whether an assignment sets a goal: by its name, as it is drawn, or as the next one of several."""
         is_next = _counts(assignment) or self._takes_next(assignment)
         return is_goal(key) or is_next or self._draws(assignment)
 
