@@ -96,6 +96,19 @@ class Source:
             node = self.parents[node]
         return node
 
+    def find_place(self, node: ast.stmt) -> tuple[str, int]:
+        """Return file and line of a statement."""
+        top: ast.AST = node
+        while top in self.parents:
+            top = self.parents[top]
+        return next(file for file, tree in self.trees.items() if tree is top), node.lineno
+
+    def find_function(self, node: ast.AST) -> Function:
+        """Return the innermost function around a node."""
+        while not isinstance(node, Function):
+            node = self.parents[node]
+        return node
+
 
 @dataclasses.dataclass(eq=False)
 class NotedCall:

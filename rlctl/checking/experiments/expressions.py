@@ -1,20 +1,26 @@
 """The experiment `expressions`: plays short episodes and notes what the expressions of the source are worth, for rules
 that look at how numbers are computed."""
 
+import ast
 import dataclasses
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
-from rlctl.checking.expressions import NotedCall, Source, record_expressions
-from rlctl.checking.instance import Context
+from rlctl.checking.expressions import ExpressionRecorder, NotedCall, Source, record_expressions
+from rlctl.checking.instance import Context, EnvironmentRaised
+from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
+from rlctl.checking.values import find_author, list_own_classes
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
+LONGEST_S = 10.0  # for episodes that are played again [s]
 MOST_NOTED = 300_000  # values; no episode begins after so many
 
 
@@ -24,6 +30,45 @@ class NotedEpisodes:
 
     source: Source
     episodes: Sequence[Sequence[NotedCall]]
+    context: Context
+    recorder: ExpressionRecorder
+    _times: list[float] = dataclasses.field(default_factory=list)  # of what was played again [s]
+
+    def play(self, number: int, steps: int, forced: Mapping[int, Mapping[int, Any]]) -> list[tuple[NotedCall, Moment]]:
+        """Play an episode again for some steps, in which expressions are worth what is given, by steps and by their
+        numbers. It ends where the environment raises an exception: what is forced may lead anywhere. Nothing is played
+        where it took too long already."""
+        kind = EPISODES[number]
+        began = read_clock()
+        if sum(self._times) > LONGEST_S:
+            return []
+        player = EpisodePlayer(self.context.instance, FIRST_SEED + number, kind, number=number, max_steps=steps)
+        played: list[tuple[NotedCall, Moment]] = []
+        try:
+            while not player.ended or not played:
+                self.recorder.forced = dict(forced.get(len(played), {}))
+                with self.recorder.call(len(played)) as noted:
+                    moment = player.step() if played else player.reset()
+                played.append((noted, moment))
+        except EnvironmentRaised:
+            pass
+        finally:
+            self.recorder.forced = {}
+            self._times.append(read_clock() - began)
+        return played
+
+    def is_used(self, cls: ast.ClassDef) -> bool:
+        """Say whether a class is one of the environment, or does something in its episodes."""
+        return cls.name in self._own_names or any(node in self._evaluated for node in cls.body)
+
+    @functools.cached_property
+    def _own_names(self) -> set[str]:
+        return {own.__name__ for own in list_own_classes(find_author(self.context.instance.env))}
+
+    @functools.cached_property
+    def _evaluated(self) -> set[ast.AST]:
+        calls = [call for episode in self.episodes for call in episode]
+        return {self.source.expressions[number].function for call in calls for number in call.values}
 
     @property
     def steps(self) -> list[NotedCall]:
@@ -55,5 +100,5 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
                 episodes[-1].append(noted)
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
-    yield Fact(TIMED, find_timed_expressions(source, episodes))
-    yield from judges_expressions.judge(NotedEpisodes(source, episodes))
+        yield Fact(TIMED, find_timed_expressions(source, episodes))
+        yield from judges_expressions.judge(NotedEpisodes(source, episodes, context, recorder))
