@@ -34,13 +34,13 @@ RULE = Rule(
     "velocity over the wrong time",
     Severity.WARNING,
     meaning="""
-        An element of the observation is how far something moved in a whole step of the environment, divided by
-        the time of one step of the physics; or several are, turned into some frame; or a number of info is, such as the
-        speed that is paid, or a term of the reward; or a line of the source divides so what changes in a whole step.
-        The velocity is too large by
-        the number of physics steps, and a controller of the real robot that measures it right gives the policy
-        something else. So it is where the change is not divided by any time, and a name or other elements say that
-        velocities are meant; otherwise that is an info. Objects that nobody moved are thrown to see it.
+        An element of the observation is how far something moved in a whole step of the environment, divided by the time
+        of one step of the physics; or several are, turned into some frame; or a number of info is, such as the speed
+        that is paid, or a term of the reward; or a line of the source divides so what changes in a whole step. The
+        velocity is too large by the number of physics steps, and a controller of the real robot that measures it right
+        gives the policy something else. So it is where the change is not divided by any time, and a name or other
+        elements say that velocities are meant; otherwise that is an info. Objects that nobody moved are thrown to see
+        it.
     """,
     fix="""
         Divide by the time between two actions, self.dt of a MujocoEnv, which is model.opt.timestep *

@@ -25,8 +25,8 @@ RULE = Rule(
         shows in what is observed. It is the phase of a gait whose period is declared, a time in seconds, passed or
         left, a time feature of the observation, or the time limit. All of them are then wrong by the number of physics
         steps in a step. Times are those of the engine; in a robot without an engine they are what it declares, as `dt`
-        and `substeps` or by a loop of its step, and what its positions and velocities confirm, or those on which most lines
-        that add up times agree.
+        and `substeps` or by a loop of its step, and what its positions and velocities confirm, or those on which most
+        lines that add up times agree.
     """,
     fix="""
         Advance the clock once in each step, by the time between two actions: the physics step times frame_skip, which

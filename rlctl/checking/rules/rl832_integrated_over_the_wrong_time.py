@@ -18,11 +18,12 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A line of the source adds a rate times the time of a whole step in each of its substeps, or times that of one
-        substep once in a step; or it shows in the motion: in a robot without an engine a position or an angle changes by its velocity times another time than all others
-        do: by the time of a whole step in each of its substeps, or by that of one substep in a whole step. It moves
-        so many times faster or slower than its velocity says. How long a step takes is what the robot declares, as
-        `dt` and `substeps` or by a loop of its step, and what its other positions and velocities confirm; or the source
-        divides the time of a step by the number of substeps, or multiplies that of a substep by it.
+        substep once in a step; or it shows in the motion: in a robot without an engine a position or an angle changes
+        by its velocity times another time than all others do: by the time of a whole step in each of its substeps, or
+        by that of one substep in a whole step. It moves so many times faster or slower than its velocity says. How long
+        a step takes is what the robot declares, as `dt` and `substeps` or by a loop of its step, and what its other
+        positions and velocities confirm; or the source divides the time of a step by the number of substeps, or
+        multiplies that of a substep by it.
     """,
     fix="Integrate everything with the time of the loop that it is in: the substep's time inside the loop of substeps.",
 )
