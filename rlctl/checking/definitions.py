@@ -46,7 +46,7 @@ class Definitions:
     def __init__(self, source: Source, calls: Sequence[NotedCall]) -> None:
         self.source = source
         self._first: dict[Function, int] = {}
-        for call in calls[:3] + calls[-3:]:
+        for call in [*calls[:3], *calls[-3:]]:
             for order, (number, _) in enumerate(call.events):
                 self._first.setdefault(source.expressions[number].function, order)
         self._assigned: dict[Function, dict[str, list[Assigned]]] = {}
@@ -109,7 +109,7 @@ class Definitions:
             if inner is None and isinstance(node.func, ast.Attribute):
                 inner = node.func.value
             return [] if inner is None else [place.at(inner)]
-        return [one for one in self.list_returned(place)]
+        return self.list_returned(place)
 
     def list_returned(self, place: Place) -> list[Place]:
         """Return what the own function that is called returns."""
@@ -117,7 +117,11 @@ class Definitions:
         match node:
             case ast.Call(func=ast.Name(id=name)):
                 function = self.find_function(name)
-            case ast.Call(func=ast.Attribute(value=ast.Name(id=owner), attr=name)) if owner not in ("np", "numpy", "math"):
+            case ast.Call(func=ast.Attribute(value=ast.Name(id=owner), attr=name)) if owner not in (
+                "np",
+                "numpy",
+                "math",
+            ):
                 function = self.find_function(name)
             case _:
                 return []
@@ -176,8 +180,18 @@ class Definitions:
                 continue
             seen.add(one.node)
             yield one
-            waiting += self.follow(one)
+            waiting += self.follow(one) or self._list_iterated(one)
             waiting += [one.at(part) for part in _list_parts(one.node)]
+
+    def _list_iterated(self, place: Place) -> list[Place]:
+        """Return through what a comprehension goes whose variable a name is."""
+        node: ast.AST = place.node
+        while isinstance(place.node, ast.Name) and isinstance(node, ast.expr | ast.comprehension):
+            for loop in getattr(node, "generators", ()):
+                if any(isinstance(one, ast.Name) and one.id == place.node.id for one in ast.walk(loop.target)):
+                    return [place.at(loop.iter)]
+            node = self.source.parents[node]
+        return []
 
 
 def _list_parts(node: ast.AST) -> Iterator[ast.expr]:

@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.definitions import CONVERSIONS, DEEPEST, Assigned, Definitions, Place
-from rlctl.checking.expressions import Expression, Function, NotedCall, Source
+from rlctl.checking.expressions import Function, NotedCall, Source
 from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
@@ -42,9 +43,12 @@ class RewardReader:
         self.definitions = Definitions(source, calls)
         self.weights = weights  # of a task's terms
         self._files = {one.function: one.file for one in source.expressions}
+        self._values: dict[ast.expr, NDArray[np.float64]] = {}
+        self._differences: list[Summand] = []
 
-    def read(self) -> list[Summand]:
-        """Return the summands, in the order in which they are written."""
+    @functools.cached_property
+    def summands(self) -> Sequence[Summand]:
+        """The summands, in the order in which they are written."""
         found: list[Summand] = []
         for place in self._list_rewards():
             for summand in self._expand(place, 1.0, "", ()):
@@ -56,9 +60,14 @@ class RewardReader:
         unique = {(one.place.node, one.weight): one for one in found}
         return list(unique.values())
 
-    def find_file(self, function: Function) -> str:
-        """Return the file of a function."""
-        return self._files[function]
+    @property
+    def differences(self) -> Sequence[Summand]:
+        """Those whose two sides are summands of their own."""
+        return self._differences if self.summands else []
+
+    def locate(self, place: Place) -> tuple[str, int]:
+        """Return file and line of an expression."""
+        return self._files[place.function], place.node.lineno
 
     def _list_rewards(self) -> Iterator[Place]:
         step = self.definitions.find_function("step")
@@ -93,6 +102,8 @@ class RewardReader:
 
         match place.node:
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as operator, right=right):
+                if isinstance(operator, ast.Sub):
+                    self._differences.append(Summand(name, place, weight, conditions))
                 yield from go(left)
                 yield from go(right, 1.0 if isinstance(operator, ast.Add) else -1.0)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -131,18 +142,17 @@ class RewardReader:
                 yield from self._expand(one, weight, own, conditions + inside)
             if not found:
                 yield Summand(own or ast.unparse(place.node), place, weight, conditions, replaces)
-        for order, one in enumerate(before):
-            inside = place.at(one.value) if place.depth == 0 else dataclasses.replace(place, node=one.value)
-            inside = dataclasses.replace(inside, depth=place.depth + 1)
-            tests = conditions + self._list_conditions(one.statement, place.function)
-            looped = self._expand_loop(inside, one, one.sign * weight, tests) if one.adds else None
+        for order, assigned in enumerate(before):
+            deeper = dataclasses.replace(place, node=assigned.value, depth=place.depth + 1)
+            tests = conditions + self._list_conditions(assigned.statement, place.function)
+            looped = self._expand_loop(deeper, assigned, assigned.sign * weight, tests) if assigned.adds else None
             if looped is not None:
                 yield from looped
                 continue
-            for part in self.definitions.select(inside, one.element):
+            for part in self.definitions.select(deeper, assigned.element):
                 # What is added is a part of its own, and its name is not that of the sum.
                 title = own if len(before) == 1 else ""
-                yield from self._expand(part, one.sign * weight, title, tests, order > 0 and not one.adds)
+                yield from self._expand(part, assigned.sign * weight, title, tests, order > 0 and not assigned.adds)
 
     def _list_conditions(self, node: ast.AST, function: Function) -> tuple[Condition, ...]:
         found: list[Condition] = []
@@ -262,8 +272,7 @@ class RewardReader:
                 for one in self.definitions.list_before(place):
                     tests = self._list_conditions(one.statement, place.function)
                     for part in self.definitions.select(place.at(one.value), one.element):
-                        for key, value, more in self._list_entries(part):
-                            yield key, value, tests + more
+                        yield from ((*entry[:2], tests + entry[2]) for entry in self._list_entries(part))
                 yield from self._list_single(place)
                 if not self.definitions.list_before(place):
                     for part in self.definitions.follow(place):
@@ -299,12 +308,18 @@ class RewardReader:
                     return None
             case ast.Name(id=name) if not name.isupper():
                 return None
+            case ast.Name(id=name):
+                known = [vars(module)[name] for module in self.source.modules if name in vars(module)]
+                if known and isinstance(known[0], int | float):
+                    return float(known[0])
             case ast.Attribute() | ast.Subscript():
                 text = ast.unparse(node)
                 if any(text in self.definitions.list_assigned(one) for one in self.definitions.called):
                     return None
-            case ast.Name():
-                pass
+                if text.startswith("self.") and isinstance(node, ast.Attribute):
+                    kept = getattr(self.source.author, node.attr, None)
+                    if type(kept) in (int, float) and text.count(".") == 1:
+                        return float(kept)  # type: ignore[arg-type]
             case _:
                 return None
         values = self.list_values(node)
@@ -312,16 +327,17 @@ class RewardReader:
 
     def list_values(self, node: ast.expr) -> NDArray[np.float64]:
         """Return all numbers that an expression was worth in the steps, in one row."""
+        if node not in self._values:
+            self._values[node] = self._join_values(node)
+        return self._values[node]
+
+    def _join_values(self, node: ast.expr) -> NDArray[np.float64]:
         one = self.source.find(node)
         if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
             return np.array([float(node.value)])
         found = [value for call in self.calls for value in call.values.get(one.number, [])] if one is not None else []
         numbers = [np.ravel(value) for value in found if value is not None]
         return np.concatenate(numbers) if numbers else np.zeros(0)
-
-    def find(self, place: Place) -> Expression | None:
-        """Return the noted expression of a place."""
-        return self.source.find(place.node)
 
 
 def list_product(node: ast.expr) -> list[ast.expr]:

@@ -2,6 +2,7 @@
 that look at how numbers are computed."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 
 from rlctl.checking.episode import EpisodePlayer
@@ -9,7 +10,8 @@ from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.expressions import NotedCall, Source, record_expressions
 from rlctl.checking.instance import Context
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
-from rlctl.checking.rule import NotApplicable
+from rlctl.checking.rule import NotApplicable, RuleFinding
+from rlctl.checking.summands import RewardReader
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
@@ -24,13 +26,23 @@ class NotedEpisodes:
 
     source: Source
     episodes: Sequence[Sequence[NotedCall]]
+    max_steps: int | None = None  # of an episode
 
     @property
     def steps(self) -> list[NotedCall]:
         """The steps of all episodes."""
         return [call for episode in self.episodes for call in episode[1:]]
 
+    @functools.cached_property
+    def reward(self) -> RewardReader:
+        """What is added up to the reward."""
+        author = self.source.author
+        weights = {} if hasattr(author, "step") else getattr(author, "reward_weights", {})  # of a task
+        return RewardReader(self.source, self.steps, weights)
 
+
+BY_EXPRESSIONS = "findings by expressions"
+"""The fact with findings that count where a rule has found nothing else: they may show the same mistake."""
 judges_expressions = JudgeHook[NotedEpisodes]()
 """Shows the noted episodes of an instance."""
 
@@ -56,4 +68,6 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
     yield Fact(TIMED, find_timed_expressions(source, episodes))
-    yield from judges_expressions.judge(NotedEpisodes(source, episodes))
+    shown = list(judges_expressions.judge(NotedEpisodes(source, episodes, instance.max_steps)))
+    yield Fact(BY_EXPRESSIONS, [message for message in shown if isinstance(message, RuleFinding)])
+    yield from (message for message in shown if not isinstance(message, RuleFinding))

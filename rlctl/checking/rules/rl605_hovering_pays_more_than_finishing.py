@@ -9,9 +9,11 @@ from rlctl.checking import rewards
 from rlctl.checking.drawn_goals import Numbers, Source
 from rlctl.checking.episode import zero_action
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
 from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
+from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -24,7 +26,8 @@ RULE = Rule(
         staying there earns more than finishing, so the policy learns to hover. rlctl repeated an episode that
         finished, and stopped shortly before its end; or every recorded success pays less than the steps would
         have paid that were left, by what episodes without a success earn. Or the check moved the goal: next to the
-        robot, which rests or which the goal accompanies, each step pays, and a success ends that for less.
+        robot, which rests or which the goal accompanies, each step pays, and a success ends that for less. The
+        same is read in the source: what its terms pay at the goal, and what success adds, or replaces them by.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
@@ -75,15 +78,20 @@ def _compare_with_moved_goal(records: Records) -> Iterator[RuleFinding]:
     hovering = rewards.discounted_steps(least.per_step, longest - FIRST_STEPS)
     whole = least.per_step * (longest - FIRST_STEPS)
     paid = max(one.success for one in incomes)
-    is_more = hovering > FAR_MORE * max(paid, 0.0)
-    # Long episodes may not be discounted so much, and evaluations are not discounted at all.
-    if not is_more and not (whole > FAR_MORE * max(paid, 0.0) and hovering > MOST_LOST * paid):
+    if not _is_worth_more(hovering, whole, paid):
         return
     staying = f"staying {least.distance:.3g} from the goal pays {least.per_step:.3g} in each step"
     message = f"success ends the episode and pays {paid:.4g}; {staying}, {whole:.4g} until step {longest}"
     message += f", or {hovering:.4g} with a discount of {rewards.DISCOUNT}"
     evidence = {"seed": least.seed, "value": hovering, "expected": f"below {paid:.6g}", "per_step": least.per_step}
     yield RuleFinding(RULE, message, evidence)
+
+
+def _is_worth_more(hovering: float, whole: float, paid: float) -> bool:
+    """Say whether staying is worth far more than a success, discounted, or also undiscounted."""
+    # Long episodes may not be discounted so much, and evaluations are not discounted at all.
+    is_more = hovering > FAR_MORE * max(paid, 0.0)
+    return is_more or (whole > FAR_MORE * max(paid, 0.0) and hovering > MOST_LOST * paid)
 
 
 @judges_goals(RULE, decides=False)
@@ -239,3 +247,24 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         message = f"{finishing}; stopping there earns {more}"
         earned = {"value": best.stopping, "expected": f"below {best.finishing:.6g}", "per_step": best.per_step}
         yield RuleFinding(RULE, message, finished.at(best.step, **earned))
+
+
+@judges_expressions(RULE, decides=False)
+def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Compare what the source pays for success with what it pays in each step next to the goal."""
+    reader = GoalReader(notes)
+    for summand, number, income in reader.find_replaced():
+        message = f"success replaces the reward by {number:.4g}, and a step next to the goal pays up to {income:.4g}"
+        evidence = {"value": number, "expected": f"above {income:.4g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
+        return
+    income, bonus, longest = reader.read_income(), reader.read_bonus(), notes.max_steps
+    if bonus is None or longest is None or not income > 0 or not reader.ends_at_success():
+        return
+    staying, whole = rewards.discounted_steps(income, longest), income * longest
+    if _is_worth_more(staying, whole, bonus):
+        message = (
+            f"success ends the episode and pays {bonus:.4g}; each step next to the goal pays {income:.3g} or more,"
+        )
+        message += f" {whole:.4g} in {longest} steps, or {staying:.4g} with a discount of {rewards.DISCOUNT}"
+        yield RuleFinding(RULE, message, {"value": staying, "expected": f"below {bonus:.6g}", "per_step": income})

@@ -1,12 +1,15 @@
 """RL620: cost that is always zero."""
 
+import ast
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import ACTION_TERMS, WEIGHED_TERMS
-from rlctl.checking.records import CheckedEpisode, Records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.records import CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rewards import (
     ENOUGH_STEPS,
     RAW_TERMS,
@@ -24,7 +27,8 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A reward term that is named after the actions, their change, or the effort of the motors, or that its
-        source computes from the action without a limit, is exactly 0 at every recorded step, although the
+        source computes from the action without a limit, or from a difference to an earlier value, is exactly 0 at
+        every recorded step, although the
         actions changed. It costs nothing, so nothing keeps the motions smooth or cheap. Terms whose name says
         that only a part counts, such as excess_torque, are not judged. An info in a plain environment, unless
         its source multiplies the term by a known number other than 0.
@@ -62,3 +66,16 @@ def _find_zero_costs(records: Records) -> Iterator[RuleFinding]:
 def _count_changes(episodes: Sequence[CheckedEpisode]) -> int:
     """Return at how many steps the action was another one than at the step before."""
     return sum(int((np.diff(episode.taken, axis=0) != 0).any(axis=1).sum()) for episode in episodes)
+
+
+@judges_expressions(RULE, decides=False)
+def _find_zero_differences(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Yield the first difference to an earlier value that is always 0."""
+    for summand, place in GoalReader(notes).find_zeros():
+        message = (
+            f"reward term {summand.name!r} compares a value with itself: {ast.unparse(place.node)} is 0 in each of"
+        )
+        message += f" {len(notes.steps)} steps, while both sides change"
+        evidence = {"term": summand.name, "value": 0.0}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(place))
+        return
