@@ -210,9 +210,20 @@ def _read_assigned(node: ast.AST) -> Iterator[tuple[ast.expr, Assigned]]:
                     for element, part in enumerate(target.elts):
                         yield part, Assigned(node, value, element)
                 else:
-                    yield target, Assigned(node, value, None)
+                    for part, sign, adds in _read_added(target, value):
+                        yield target, Assigned(node, part, None, sign, adds)
         case ast.AnnAssign(target=target, value=value) if value is not None:
             yield target, Assigned(node, value, None)
         case ast.AugAssign(target=target, op=ast.Add() | ast.Sub() as operator, value=value):
             sign = 1.0 if isinstance(operator, ast.Add) else -1.0
             yield target, Assigned(node, value, None, sign, True)
+
+
+def _read_added(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, float, bool]]:
+    """Return what `x = x + a - b` adds to x, with the signs; otherwise the value itself."""
+    text, node = ast.unparse(target), value
+    parts: list[tuple[ast.expr, float, bool]] = []
+    while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
+        parts.insert(0, (node.right, 1.0 if isinstance(node.op, ast.Add) else -1.0, True))
+        node = node.left
+    return parts if parts and ast.unparse(node) == text else [(value, 1.0, False)]

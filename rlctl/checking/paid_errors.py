@@ -76,12 +76,11 @@ class ErrorReader:
             if not summand.weight < 0 or set(split_name(summand.name)) & (OPPOSITE_WORDS | {"velocity", "speed"}):
                 continue
             place = self.definitions.resolve(summand.place)
-            inner = _read_summed(place.node)
+            inner = read_summed(place.node)
             if inner is None or self._is_product(place.at(inner), summand.name):
                 continue
-            sums, parts = self.reward.list_values(place.node), self.reward.list_values(inner)
-            # NumPy sums every world's row by itself, so the parts are numbers of both signs, too.
-            if sums.size >= FEWEST and has_both_signs(sums, CLEAR) and has_both_signs(parts, CLEAR):
+            sums = self.reward.list_values(place.node)
+            if sums.size >= FEWEST and has_both_signs(sums, CLEAR):
                 yield summand, place
 
     def _is_product(self, place: Place, name: str) -> bool:
@@ -233,7 +232,7 @@ def _list_directed(notes: NotedEpisodes) -> Iterator[str]:
                     yield ast.unparse(right)
 
 
-def _read_summed(node: ast.expr) -> ast.expr | None:
+def read_summed(node: ast.expr) -> ast.expr | None:
     """Return what is summed; None for what is no sum."""
     match node:
         case ast.Call(func=ast.Name() | ast.Attribute() as function) if read_name(function) in SUMS:

@@ -11,8 +11,8 @@ import numpy as np
 
 from rlctl.checking.definitions import Place
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader
-from rlctl.checking.summands import Summand, read_name
+from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed
+from rlctl.checking.summands import SUMS, Summand, read_name
 from rlctl.checking.term_names import split_name
 
 AVOIDED_WORDS = {
@@ -85,25 +85,27 @@ class GoalReader:
     def _list_words(self, summand: Summand) -> set[str]:
         words = set(split_name(summand.name))
         for one in self.definitions.walk(summand.place):
-            words |= set(split_name(read_name(one.node)))
+            words |= set(split_name(read_name(one.node))) - KERNELS
         return words
 
     def _is_avoided(self, summand: Summand) -> bool:
         return bool(self._list_words(summand) & AVOIDED_WORDS) or math.isnan(summand.weight)
 
     def _is_nearness(self, place: Place) -> bool:
-        """Say whether an expression is a function that falls with a distance, or a sum of some."""
+        """Say whether an expression is a function that falls with the distance of two things, or a sum of some."""
         resolved = self.definitions.resolve(place)
-        for part in ast.walk(resolved.node):
-            if isinstance(part, ast.Call) and read_name(part.func) in KERNELS and part.args:
-                values = self.reward.list_values(part)
-                is_kernel = values.size >= FEWEST and values.min() >= 0 and values.max() <= 1 + 1e-9
-                return is_kernel and any(
-                    isinstance(one.node, ast.Call) and read_name(one.node.func) in DISTANCES
-                    for one in self.definitions.walk(resolved.at(part.args[0]))
-                )
-            if isinstance(part, ast.Call) and read_name(part.func) not in {"sum", "mean", "float", "max", "min"}:
-                return False
+        match resolved.node:
+            case ast.BinOp(left=left, op=ast.Mult(), right=right):
+                constants = [self.reward.read_constant(side) for side in (left, right)]
+                others = [side for side, number in zip((left, right), constants, strict=True) if number is None]
+                return len(others) == 1 and self._is_nearness(resolved.at(others[0]))
+            case ast.Call(func=function, args=[argument, *_]) if read_name(function) in KERNELS:
+                values = self.reward.list_values(resolved.node)
+                is_kernel = values.size >= FEWEST and 0 <= values.min() and values.max() <= 1 + 1e-9
+                return is_kernel and any(map(self._is_distance, self.definitions.walk(resolved.at(argument))))
+            case ast.Call(func=function) if read_name(function) in SUMS:
+                summed = read_summed(resolved.node)
+                return summed is not None and self._is_nearness(resolved.at(summed))
         return False
 
     def _is_distance_to_goal(self, place: Place) -> bool:
