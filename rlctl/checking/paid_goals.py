@@ -101,7 +101,7 @@ class GoalReader:
                 return len(others) == 1 and self._is_nearness(resolved.at(others[0]))
             case ast.Call(func=function, args=[argument, *_]) if read_name(function) in KERNELS:
                 values = self.reward.list_values(resolved.node)
-                is_kernel = values.size >= FEWEST and 0 <= values.min() and values.max() <= 1 + 1e-9
+                is_kernel = values.size >= FEWEST and values.min() >= 0 and values.max() <= 1 + 1e-9
                 return is_kernel and any(map(self._is_distance, self.definitions.walk(resolved.at(argument))))
             case ast.Call(func=function) if read_name(function) in SUMS:
                 summed = read_summed(resolved.node)

@@ -42,7 +42,9 @@ class RewardReader:
         self.source, self.calls = source, calls
         self.definitions = Definitions(source, calls)
         self.weights = weights  # of a task's terms
-        self._files = {one.function: one.file for one in source.expressions}
+        self._files = {
+            node: file for file, tree in source.trees.items() for node in ast.walk(tree) if isinstance(node, Function)
+        }
         self._values: dict[ast.expr, NDArray[np.float64]] = {}
         self._differences: list[Summand] = []
 

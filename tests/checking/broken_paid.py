@@ -1,7 +1,9 @@
 """Robots whose reward has a wrong sign, index or bonus in one expression, written in several ways, next to twins."""
 
 import gymnasium as gym
+import mujoco
 import numpy as np
+from broken_sweeps import Rover
 from gymnasium import spaces
 
 DT, LONGEST = 0.05, 200
@@ -144,3 +146,22 @@ class RL620DockerComparesWithItself(Docker):
 class RL605DockerWaits(Docker):
     def shape(self, gap):
         return 0.5 - 0.2 * np.tanh(gap)
+
+
+class RoverIsSlow(Rover):
+    """Its reward subtracts how fast it slides over the ground."""
+
+    def sliding_speed(self):
+        six = np.zeros(6)
+        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, 1, six, 0)
+        return np.linalg.norm(six[3:5])
+
+    def pay_speed(self, missing):
+        return super().pay_speed(missing) - 0.05 * self.sliding_speed()
+
+
+class RL640RoverIsUpright(RoverIsSlow):
+    def sliding_speed(self):
+        six = np.zeros(6)
+        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, 1, six, 0)
+        return np.linalg.norm(six[0:2])
