@@ -11,6 +11,7 @@ CONVERSIONS = {
     "nan_to_num", "ravel", "squeeze",
 }  # fmt: skip
 """Functions and methods that return the numbers they are given."""
+LIBRARIES = {"jnp", "math", "mujoco", "np", "numpy", "p", "pybullet", "torch"}
 DEEPEST = 12  # names and calls that are followed
 BEGINNINGS = {"__init__", "reset", "reset_model", "__post_init__"}
 
@@ -117,10 +118,8 @@ class Definitions:
         match node:
             case ast.Call(func=ast.Name(id=name)):
                 function = self.find_function(name)
-            case ast.Call(func=ast.Attribute(value=ast.Name(id=owner), attr=name)) if owner not in (
-                "np",
-                "numpy",
-                "math",
+            case ast.Call(func=ast.Attribute(value=ast.Name() | ast.Attribute() as owner, attr=name)) if (
+                _find_root(owner) not in LIBRARIES
             ):
                 function = self.find_function(name)
             case _:
@@ -192,6 +191,13 @@ class Definitions:
                     return [place.at(loop.iter)]
             node = self.source.parents[node]
         return []
+
+
+def _find_root(node: ast.expr) -> str:
+    """Return the name with which `a.b.c` begins."""
+    while isinstance(node, ast.Attribute):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else ""
 
 
 def _list_parts(node: ast.AST) -> Iterator[ast.expr]:

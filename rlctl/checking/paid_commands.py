@@ -101,16 +101,21 @@ class CommandReader:
         return np.concatenate(rows) if rows and rows[0].shape[1] > 1 else None
 
     def _list_paid(self, command: str) -> set[int]:
-        """Return the numbers of a command that are in any sum, difference or product of the reward."""
+        """Return the numbers of a command that the reward is computed from, and not only compared with limits."""
         found: set[int] = set()
         for _, places in self.walked:
             for place in places:
-                if isinstance(place.node, ast.BinOp):
-                    for side in (place.node.left, place.node.right):
-                        index = self.read_index(place.at(side))
-                        if index is not None and index[0] == command:
-                            found.add(index[1])
+                index = self.read_index(place)
+                if index is not None and index[0] == command and not self._is_in_comparison(place.node):
+                    found.add(index[1])
         return found
+
+    def _is_in_comparison(self, node: ast.AST) -> bool:
+        while isinstance(node, ast.expr):
+            if isinstance(node, ast.Compare):
+                return True
+            node = self.notes.source.parents[node]
+        return False
 
     def _is_used_whole(self, command: str) -> bool:
         parents = self.notes.source.parents

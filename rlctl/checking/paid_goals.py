@@ -13,7 +13,7 @@ from rlctl.checking.definitions import Place
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed
 from rlctl.checking.summands import SUMS, Summand, read_name
-from rlctl.checking.term_names import split_name
+from rlctl.checking.term_names import is_about_time, split_name
 
 AVOIDED_WORDS = {
     "agent", "avoid", "avoidance", "barrier", "border", "boundary", "bounds", "clearance", "cliff", "collision",
@@ -278,6 +278,14 @@ class GoalReader:
             is_power = isinstance(resolved.node, ast.BinOp) and isinstance(resolved.node.op, ast.Pow)
             return 0.0 if is_small or is_power else float(values.min())
         return 0.0
+
+    def pays_for_time(self) -> bool:
+        """Say whether a constant that is called after time is added in each step."""
+        return any(
+            one.weight * (self.reward.read_constant(one.place.node) or 0.0) > 0
+            for one in self.reward.summands
+            if is_about_time(one.name) and not one.conditions
+        )
 
     def read_bonus(self) -> float | None:
         """Return what a success pays at once; None where nothing depends on it."""

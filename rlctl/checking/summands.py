@@ -151,7 +151,10 @@ class RewardReader:
             if looped is not None:
                 yield from looped
                 continue
-            for part in self.definitions.select(deeper, assigned.element):
+            parts = self.definitions.select(deeper, assigned.element)
+            if not parts:
+                yield Summand(own or ast.unparse(place.node), place, weight, tests)
+            for part in parts:
                 # What is added is a part of its own, and its name is not that of the sum.
                 title = own if len(before) == 1 else ""
                 yield from self._expand(part, assigned.sign * weight, title, tests, order > 0 and not assigned.adds)

@@ -55,7 +55,7 @@ def note(name):
                 with recorder.call(player.steps + 1) as noted:
                     player.step()
                 episodes[-1].append(noted)
-    return NotedEpisodes(source, episodes, context.instance.max_steps)
+    return NotedEpisodes(source, episodes)
 
 
 def test_the_summands_of_a_weighted_loop_have_names_and_weights():

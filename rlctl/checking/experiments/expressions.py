@@ -26,7 +26,6 @@ class NotedEpisodes:
 
     source: Source
     episodes: Sequence[Sequence[NotedCall]]
-    max_steps: int | None = None  # of an episode
 
     @property
     def steps(self) -> list[NotedCall]:
@@ -68,6 +67,6 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
     yield Fact(TIMED, find_timed_expressions(source, episodes))
-    shown = list(judges_expressions.judge(NotedEpisodes(source, episodes, instance.max_steps)))
+    shown = list(judges_expressions.judge(NotedEpisodes(source, episodes)))
     yield Fact(BY_EXPRESSIONS, [message for message in shown if isinstance(message, RuleFinding)])
     yield from (message for message in shown if not isinstance(message, RuleFinding))

@@ -15,7 +15,7 @@ from rlctl.checking.experiments.search import ActionSearch, judges_searches
 from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
-from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 
 RULE = Rule(
     "RL605",
@@ -44,6 +44,8 @@ MOST_LOST = 0.5  # times as much as success, discounted, where the undiscounted 
 LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
 
 
+IN_SOURCE = "incomes in the source"
+"""The fact with what each step pays next to the goal, what success pays, and whether time is paid."""
 NEAR_GOAL = "near the goal"
 """The fact of an `Income`."""
 FIRST_STEPS, RESTING_STEPS = 15, 12  # with the goal that reset drew, in which robots settle; and next to the robot
@@ -62,10 +64,16 @@ class Income:
     success: float
 
 
-@judges_records(RULE, *rewards.WITH_SEARCH, "goals")
+@judges_records(RULE, *rewards.WITH_SEARCH, "goals", "expressions")
 def _compare_incomes(records: Records) -> Iterator[RuleFinding]:
-    found = list(_compare_successes(records))
-    yield from found or _compare_with_moved_goal(records)
+    in_source = list(_compare_in_source(records))
+    try:
+        found = list(_compare_successes(records)) or list(_compare_with_moved_goal(records))
+    except (NotApplicable, NotJudged):
+        if not in_source:
+            raise
+        found = []
+    yield from found or in_source
 
 
 def _compare_with_moved_goal(records: Records) -> Iterator[RuleFinding]:
@@ -251,20 +259,27 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
 
 @judges_expressions(RULE, decides=False)
 def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
-    """Compare what the source pays for success with what it pays in each step next to the goal."""
+    """Read what the source pays for success, and what it pays in each step next to the goal."""
     reader = GoalReader(notes)
     for summand, number, income in reader.find_replaced():
         message = f"success replaces the reward by {number:.4g}, and a step next to the goal pays up to {income:.4g}"
         evidence = {"value": number, "expected": f"above {income:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
         return
-    income, bonus, longest = reader.read_income(), reader.read_bonus(), notes.max_steps
-    if bonus is None or longest is None or not income > 0 or not reader.ends_at_success():
+    income, bonus = reader.read_income(), reader.read_bonus()
+    if bonus is not None and income > 0 and reader.ends_at_success():
+        yield Fact(IN_SOURCE, (income, bonus, reader.pays_for_time()))
+
+
+def _compare_in_source(records: Records) -> Iterator[RuleFinding]:
+    if IN_SOURCE not in records.facts:
         return
+    income, bonus, pays_for_time = records.facts[IN_SOURCE]
+    steps = [one.steps for one in records.trajectories]
+    longest = records.require_built().max_steps or max(steps, default=0)
     staying, whole = rewards.discounted_steps(income, longest), income * longest
-    if _is_worth_more(staying, whole, bonus):
-        message = (
-            f"success ends the episode and pays {bonus:.4g}; each step next to the goal pays {income:.3g} or more,"
-        )
-        message += f" {whole:.4g} in {longest} steps, or {staying:.4g} with a discount of {rewards.DISCOUNT}"
+    if _is_worth_more(staying, whole, bonus) or (pays_for_time and whole > bonus):
+        message = f"success ends the episode and pays {bonus:.4g}; in the source, each step next to the goal pays"
+        message += f" {income:.3g} or more, {whole:.4g} in {longest} steps, or {staying:.4g} with a discount of"
+        message += f" {rewards.DISCOUNT}"
         yield RuleFinding(RULE, message, {"value": staying, "expected": f"below {bonus:.6g}", "per_step": income})
