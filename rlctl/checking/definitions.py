@@ -17,15 +17,15 @@ BEGINNINGS = {"__init__", "reset", "reset_model", "__post_init__"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Place:
+class ReadExpression:
     """An expression, and what the function in which it stands was called with."""
 
     node: ast.expr
     function: Function
-    arguments: Mapping[str, "Place"]
+    arguments: Mapping[str, "ReadExpression"]
     depth: int = 0
 
-    def at(self, node: ast.expr) -> "Place":
+    def at(self, node: ast.expr) -> "ReadExpression":
         """Return the place of another expression of the same call."""
         return dataclasses.replace(self, node=node)
 
@@ -71,7 +71,7 @@ class Definitions:
             self._assigned[function] = found
         return self._assigned[function]
 
-    def list_before(self, place: Place) -> list[Assigned]:
+    def list_before(self, place: ReadExpression) -> list[Assigned]:
         """Return what was assigned to a name or attribute before this place, from the last time on that it was
         replaced in any case."""
         text = ast.unparse(place.node)
@@ -86,7 +86,7 @@ class Definitions:
                 return several[index:]
         return several
 
-    def follow(self, place: Place) -> list[Place]:
+    def follow(self, place: ReadExpression) -> list[ReadExpression]:
         """Return the expressions that a name, an attribute or a call of an own function stands for."""
         if place.depth > DEEPEST:
             return []
@@ -104,7 +104,7 @@ class Definitions:
                 return self._follow_attribute(place)
         return []
 
-    def _follow_call(self, place: Place, node: ast.Call, name: str) -> list[Place]:
+    def _follow_call(self, place: ReadExpression, node: ast.Call, name: str) -> list[ReadExpression]:
         if name in CONVERSIONS:
             inner = node.args[0] if node.args and name not in ("astype", "item", "copy", "flatten", "ravel") else None
             if inner is None and isinstance(node.func, ast.Attribute):
@@ -112,7 +112,7 @@ class Definitions:
             return [] if inner is None else [place.at(inner)]
         return self.list_returned(place)
 
-    def list_returned(self, place: Place) -> list[Place]:
+    def list_returned(self, place: ReadExpression) -> list[ReadExpression]:
         """Return what the own function that is called returns."""
         node = place.node
         match node:
@@ -132,29 +132,29 @@ class Definitions:
         arguments = {key: place.at(value) for key, value in zip(names, node.args, strict=False)}
         arguments |= {word.arg: place.at(word.value) for word in node.keywords if word.arg}
         returned = [one.value for one in ast.walk(function) if isinstance(one, ast.Return) and one.value is not None]
-        return [Place(value, function, arguments, place.depth) for value in returned]
+        return [ReadExpression(value, function, arguments, place.depth) for value in returned]
 
-    def _follow_attribute(self, place: Place) -> list[Place]:
+    def _follow_attribute(self, place: ReadExpression) -> list[ReadExpression]:
         text = ast.unparse(place.node)
         if isinstance(place.node, ast.Attribute):
             function = self.find_function(place.node.attr)
             if function is not None and any("property" in ast.unparse(one) for one in function.decorator_list):
                 returned = [one.value for one in ast.walk(function) if isinstance(one, ast.Return) and one.value]
-                return [Place(value, function, {}, place.depth) for value in returned]
-        found: list[Place] = []
+                return [ReadExpression(value, function, {}, place.depth) for value in returned]
+        found: list[ReadExpression] = []
         for function in self.called:
             if function is not place.function:
                 several = self.list_assigned(function).get(text, ())
                 if any(one.adds for one in several):
                     return []
-                inside = Place(place.node, function, {}, place.depth)
+                inside = ReadExpression(place.node, function, {}, place.depth)
                 found += self._select_all(inside, several)
         return found
 
-    def _select_all(self, place: Place, several: Sequence[Assigned]) -> list[Place]:
+    def _select_all(self, place: ReadExpression, several: Sequence[Assigned]) -> list[ReadExpression]:
         return [part for one in several for part in self.select(place.at(one.value), one.element)]
 
-    def select(self, place: Place, element: int | None) -> list[Place]:
+    def select(self, place: ReadExpression, element: int | None) -> list[ReadExpression]:
         """Return the element of a tuple that an expression is worth, as far as it can be seen."""
         if element is None:
             return [place]
@@ -162,7 +162,7 @@ class Definitions:
             return [place.at(place.node.elts[element])] if element < len(place.node.elts) else []
         return [part for one in self.follow(place) for part in self.select(one, element)]
 
-    def resolve(self, place: Place) -> Place:
+    def resolve(self, place: ReadExpression) -> ReadExpression:
         """Follow names and calls as long as each stands for one expression only."""
         while True:
             found = self.follow(place)
@@ -170,7 +170,7 @@ class Definitions:
                 return place
             place = found[0]
 
-    def walk(self, place: Place, most: int = 60) -> Iterator[Place]:
+    def walk(self, place: ReadExpression, most: int = 60) -> Iterator[ReadExpression]:
         """Yield an expression, its parts, and those of what they stand for."""
         waiting, seen = [place], set[ast.AST]()
         while waiting and len(seen) < most * 10:
@@ -182,7 +182,7 @@ class Definitions:
             waiting += self.follow(one) or self._list_iterated(one)
             waiting += [one.at(part) for part in _list_parts(one.node)]
 
-    def _list_iterated(self, place: Place) -> list[Place]:
+    def _list_iterated(self, place: ReadExpression) -> list[ReadExpression]:
         """Return through what a comprehension goes whose variable a name is."""
         node: ast.AST = place.node
         while isinstance(place.node, ast.Name) and isinstance(node, ast.expr | ast.comprehension):

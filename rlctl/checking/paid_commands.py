@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.definitions import Place
+from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import COMMAND_WORDS, WANTED_WORDS, ErrorReader, has_both_signs
 from rlctl.checking.summands import Summand, read_name
@@ -28,8 +28,8 @@ class Compared:
     summand: Summand
     command: str
     index: int
-    other: Place
-    place: Place  # of the difference
+    other: ReadExpression
+    place: ReadExpression  # of the difference
 
 
 class CommandReader:
@@ -53,7 +53,7 @@ class CommandReader:
                             if found is not None:
                                 yield Compared(summand, *found, place.at(other), place)
 
-    def read_index(self, place: Place) -> tuple[str, int] | None:
+    def read_index(self, place: ReadExpression) -> tuple[str, int] | None:
         """Return which number of which command an expression is; None if it is none."""
         for _ in range(4):
             node = place.node
@@ -133,7 +133,7 @@ class CommandReader:
                         return True
         return False
 
-    def find_lengths(self) -> Iterator[tuple[Summand, Place]]:
+    def find_lengths(self) -> Iterator[tuple[Summand, ReadExpression]]:
         """Yield differences of the length of a command and another length, if nothing else compares the command."""
         for summand, places in self.walked:
             for place in places:
@@ -149,7 +149,7 @@ class CommandReader:
                         if len(commands) == 1 and is_turned and not self._is_compared(commands[0]):
                             yield summand, place
 
-    def _read_length(self, place: Place) -> Place | None:
+    def _read_length(self, place: ReadExpression) -> ReadExpression | None:
         """Return the vector of which an expression is the length."""
         place = self.definitions.resolve(place)
         match place.node:
@@ -157,10 +157,10 @@ class CommandReader:
                 return place.at(only)
         return None
 
-    def _has_command(self, place: Place) -> bool:
+    def _has_command(self, place: ReadExpression) -> bool:
         return any(_is_command(one.node, COMMAND_WORDS) for one in (place, self.definitions.resolve(place)))
 
-    def _is_compared(self, command: Place) -> bool:
+    def _is_compared(self, command: ReadExpression) -> bool:
         """Say whether the reward also has a difference or a product with this vector, or its first two numbers."""
         root = self._read_root(command)
         for _, places in self.walked:
@@ -174,7 +174,7 @@ class CommandReader:
                             return True
         return False
 
-    def _read_root(self, place: Place) -> str:
+    def _read_root(self, place: ReadExpression) -> str:
         place = self.definitions.resolve(place)
         while isinstance(place.node, ast.Subscript):
             place = self.definitions.resolve(place.at(place.node.value))
@@ -194,7 +194,7 @@ class CommandReader:
                                 yield from self._find_other_axis(summand, places, place, side)
 
     def _find_other_axis(
-        self, summand: Summand, places: Sequence[Place], place: Place, side: Place
+        self, summand: Summand, places: Sequence[ReadExpression], place: ReadExpression, side: ReadExpression
     ) -> Iterator[tuple[Summand, str, str, str]]:
         resolved = self.definitions.resolve(side)
         found = self._read_component(resolved)
@@ -209,12 +209,12 @@ class CommandReader:
             named = sorted(word for word in words if word in axes)[0]
             yield summand, named, ast.unparse(resolved.node), AXES[meant.pop()]
 
-    def _list_targets(self, place: Place) -> set[str]:
+    def _list_targets(self, place: ReadExpression) -> set[str]:
         statement = self.notes.source.find_statement(place.node)
         targets = statement.targets if isinstance(statement, ast.Assign) else []
         return {read_name(target) for target in targets}
 
-    def _read_component(self, place: Place) -> tuple[dict[str, int], int] | None:
+    def _read_component(self, place: ReadExpression) -> tuple[dict[str, int], int] | None:
         """Return by which words the axes of a vector are meant, and along which axis this number of it is."""
         index = read_last_index(place.node)
         if index is None or not isinstance(place.node, ast.Subscript):

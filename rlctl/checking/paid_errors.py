@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.definitions import Place
+from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.summands import SUMS, RewardReader, Summand, list_product, read_name
 from rlctl.checking.term_names import ENERGY_WORDS, OPPOSITE_WORDS, PLACE_WORDS, split_name
@@ -41,7 +41,7 @@ class SignedError:
     """A difference that counts with its sign, although the reward should be largest where it is 0."""
 
     summand: Summand
-    place: Place  # of the difference, or of the sum of them
+    place: ReadExpression  # of the difference, or of the sum of them
     outer: str  # how it counts
     sign: float  # of what is paid for it
 
@@ -70,7 +70,7 @@ class ErrorReader:
                 if self._is_signed_error(summand.place, texts, summand, needs_both=False):
                     yield SignedError(summand, summand.place, "", summand.weight)
 
-    def find_sums(self) -> Iterator[tuple[Summand, Place]]:
+    def find_sums(self) -> Iterator[tuple[Summand, ReadExpression]]:
         """Yield costs that are sums of numbers of both signs, and so of both signs themselves."""
         for summand in self.reward.summands:
             if not summand.weight < 0 or set(split_name(summand.name)) & (OPPOSITE_WORDS | {"velocity", "speed"}):
@@ -83,7 +83,7 @@ class ErrorReader:
             if sums.size >= FEWEST and has_both_signs(sums, CLEAR):
                 yield summand, place
 
-    def _is_product(self, place: Place, name: str) -> bool:
+    def _is_product(self, place: ReadExpression, name: str) -> bool:
         """Say whether what is summed is a product, which may be meant: a scalar product, but not a power."""
         node = self.definitions.resolve(place).node
         is_difference = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
@@ -92,7 +92,7 @@ class ErrorReader:
         is_product = isinstance(node, ast.BinOp) and not set(split_name(name)) & ENERGY_WORDS
         return is_product and not any(self._is_fixed(place.at(one)) for one in (node.left, node.right))  # type: ignore[attr-defined]
 
-    def find_powers(self) -> Iterator[tuple[Summand, Place]]:
+    def find_powers(self) -> Iterator[tuple[Summand, ReadExpression]]:
         """Yield what is paid as an even power of a cosine that is negative at times, and is used with its sign too."""
         for summand in self.reward.summands:
             for factor in list_product(summand.place.node) if summand.weight > 0 else ():
@@ -105,7 +105,7 @@ class ErrorReader:
                         if self._is_cosine(place.at(base)) and ast.unparse(base) in self._directed:
                             yield summand, place.at(base)
 
-    def _is_cosine(self, place: Place) -> bool:
+    def _is_cosine(self, place: ReadExpression) -> bool:
         node = self.definitions.resolve(place).node
         match node:
             case ast.BinOp(op=ast.MatMult()):
@@ -116,7 +116,7 @@ class ErrorReader:
                 return ast.unparse(node.slice).replace("(", "").replace(")", "").endswith("2, 2")
         return False
 
-    def _list_kernels(self, summand: Summand) -> Iterator[tuple[str, Place, float]]:
+    def _list_kernels(self, summand: Summand) -> Iterator[tuple[str, ReadExpression, float]]:
         """Yield arguments of functions that should be largest where the argument is 0."""
         if not summand.weight:
             return
@@ -137,7 +137,9 @@ class ErrorReader:
                 case ast.Call(func=function) if read_name(function) in SUMS and summand.weight < 0:
                     yield "", place, -1.0
 
-    def _list_linear(self, place: Place, sign: float, texts: list[str]) -> Iterator[tuple[float, Place]]:
+    def _list_linear(
+        self, place: ReadExpression, sign: float, texts: list[str]
+    ) -> Iterator[tuple[float, ReadExpression]]:
         """Yield what an expression is proportional to."""
         texts.append(ast.unparse(place.node))
         match place.node:
@@ -162,13 +164,13 @@ class ErrorReader:
                 if len(found) == 1:
                     yield from self._list_linear(found[0], sign, texts)
 
-    def _is_fixed(self, place: Place) -> bool:
+    def _is_fixed(self, place: ReadExpression) -> bool:
         if self.reward.read_constant(place.node) is not None:
             return True
         values = self.reward.list_values(place.node)
         return bool(values.size) and bool((values == values[0]).all())
 
-    def _is_signed_error(self, place: Place, texts: Sequence[str], summand: Summand, needs_both: bool) -> bool:
+    def _is_signed_error(self, place: ReadExpression, texts: Sequence[str], summand: Summand, needs_both: bool) -> bool:
         match place.node:
             case ast.BinOp(left=left, op=ast.Sub(), right=right):
                 sides = [place.at(left), place.at(right)]
@@ -186,17 +188,17 @@ class ErrorReader:
         is_sized = is_sized or reverse in self._sized
         return has_both or (is_sized and not needs_both and not summand.conditions)
 
-    def is_wanted(self, place: Place) -> bool:
+    def is_wanted(self, place: ReadExpression) -> bool:
         """Say whether a value is what a command or a goal says, by its name."""
         places = [place, self.definitions.resolve(place)]
         words = {word for one in places for word in split_name(read_name(one.node))}
         return bool(words & WANTED_WORDS)
 
-    def _is_size(self, place: Place) -> bool:
+    def _is_size(self, place: ReadExpression) -> bool:
         node = self.definitions.resolve(place).node
         return any(isinstance(one, ast.Call) and read_name(one.func) in SIZES for one in [node])
 
-    def is_between_steps(self, place: Place) -> bool:
+    def is_between_steps(self, place: ReadExpression) -> bool:
         """Say whether a difference is that to a value of the step before, by names or by values."""
         words = {word for node in ast.walk(place.node) for word in split_name(read_name(node))}  # type: ignore[arg-type]
         one = self.notes.source.find(place.node)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.definitions import Place
+from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed
 from rlctl.checking.summands import SUMS, Summand, read_name
@@ -56,7 +56,7 @@ class PaidDistance:
 
     how: WrongSign
     summand: Summand
-    place: Place
+    place: ReadExpression
 
 
 class GoalReader:
@@ -91,7 +91,7 @@ class GoalReader:
     def _is_avoided(self, summand: Summand) -> bool:
         return bool(self._list_words(summand) & AVOIDED_WORDS) or math.isnan(summand.weight)
 
-    def _is_nearness(self, place: Place) -> bool:
+    def _is_nearness(self, place: ReadExpression) -> bool:
         """Say whether an expression is a function that falls with the distance of two things, or a sum of some."""
         resolved = self.definitions.resolve(place)
         match resolved.node:
@@ -108,7 +108,7 @@ class GoalReader:
                 return summed is not None and self._is_nearness(resolved.at(summed))
         return False
 
-    def _is_distance_to_goal(self, place: Place) -> bool:
+    def _is_distance_to_goal(self, place: ReadExpression) -> bool:
         """Say whether it is the length of a difference of a goal and something else."""
         resolved = self.definitions.resolve(place)
         match resolved.node:
@@ -130,7 +130,7 @@ class GoalReader:
         others = [one for one in self.reward.summands if one.weight * summand.weight < 0]
         return any(set(split_name(one.name)) & EARLIER_WORDS or self._is_earlier(one.place) for one in others)
 
-    def _is_earlier(self, place: Place) -> bool:
+    def _is_earlier(self, place: ReadExpression) -> bool:
         words = {word for node in ast.walk(place.node) for word in split_name(read_name(node))}  # type: ignore[arg-type]
         return bool(words & EARLIER_WORDS)
 
@@ -149,7 +149,7 @@ class GoalReader:
         values = self.reward.list_values(new)
         return values.size >= FEWEST and values.min() >= 0 and self._is_distance(summand.place.at(new))
 
-    def _is_distance(self, place: Place) -> bool:
+    def _is_distance(self, place: ReadExpression) -> bool:
         """Say whether it is a distance between two things."""
         resolved = self.definitions.resolve(place)
         match resolved.node:
@@ -161,7 +161,7 @@ class GoalReader:
                 return True
         return False
 
-    def find_zeros(self) -> Iterator[tuple[Summand, Place]]:
+    def find_zeros(self) -> Iterator[tuple[Summand, ReadExpression]]:
         """Yield differences to an earlier value that are always 0, while the value changes."""
         for summand in [*self.reward.summands, *self.reward.differences]:
             for place in self.definitions.walk(summand.place):
@@ -174,7 +174,7 @@ class GoalReader:
                         if sum(earlier) == 1 and is_zero and all(len(np.unique(part)) >= FEWEST for part in parts):
                             yield summand, place
 
-    def read_success(self) -> Place | None:
+    def read_success(self) -> ReadExpression | None:
         """Return the expression that tells success."""
         method = self.definitions.find_function("is_success")
         step = self.definitions.find_function("step")
@@ -184,16 +184,16 @@ class GoalReader:
                 case ast.Dict(keys=keys, values=values):
                     for key, value in zip(keys, values, strict=True):
                         if isinstance(key, ast.Constant) and key.value in SUCCESS_KEYS:
-                            return self._resolve_flag(Place(value, step, {}))
+                            return self._resolve_flag(ReadExpression(value, step, {}))
                 case ast.Assign(targets=[ast.Subscript(slice=ast.Constant(value=key))], value=value):
                     if key in SUCCESS_KEYS:
-                        return self._resolve_flag(Place(value, step, {}))
+                        return self._resolve_flag(ReadExpression(value, step, {}))
         for node in ast.walk(method) if method is not None else ():
             if isinstance(node, ast.Return) and node.value is not None and method is not None:
-                return self._resolve_flag(Place(node.value, method, {}))
+                return self._resolve_flag(ReadExpression(node.value, method, {}))
         return None
 
-    def _resolve_flag(self, place: Place) -> Place:
+    def _resolve_flag(self, place: ReadExpression) -> ReadExpression:
         while True:
             match place.node:
                 case ast.Call(func=ast.Name(id="bool" | "float" | "int"), args=[only]):
@@ -204,13 +204,13 @@ class GoalReader:
                         return place
                     place = found[0]
 
-    def is_success(self, test: ast.expr, place: Place) -> bool:
+    def is_success(self, test: ast.expr, place: ReadExpression) -> bool:
         """Say whether a test asks for success."""
         asked = self._resolve_flag(place.at(test)).node
         return any(asked is part.node for part in self.success_parts)
 
     @functools.cached_property
-    def success_parts(self) -> Sequence[Place]:
+    def success_parts(self) -> Sequence[ReadExpression]:
         """What tells success, and what all has to be true for it."""
         success = self.read_success()
         parts = [success] if success is not None else []
@@ -225,19 +225,19 @@ class GoalReader:
         if success is None or step is None:
             return False
         flags = [
-            Place(node.value.elts[2], step, {})
+            ReadExpression(node.value.elts[2], step, {})
             for node in ast.walk(step)
             if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple) and len(node.value.elts) == 5
         ]
         method = self.definitions.find_function("is_terminated")
         flags += [
-            Place(node.value, method, {})
+            ReadExpression(node.value, method, {})
             for node in ast.walk(method or step)
             if method is not None and isinstance(node, ast.Return) and node.value is not None
         ]
         return any(self._has_success(flag, success) for flag in flags)
 
-    def _has_success(self, flag: Place, success: Place) -> bool:
+    def _has_success(self, flag: ReadExpression, success: ReadExpression) -> bool:
         for place in self.definitions.walk(flag):
             if any(place.node is part.node for part in self.success_parts):
                 return True

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.definitions import CONVERSIONS, DEEPEST, Assigned, Definitions, Place
+from rlctl.checking.definitions import CONVERSIONS, DEEPEST, Assigned, Definitions, ReadExpression
 from rlctl.checking.expressions import Function, NotedCall, Source
 from rlctl.checking.term_names import split_name
 
@@ -24,7 +24,7 @@ class Summand:
     """A part of the reward."""
 
     name: str  # of the variable, or the key of the dictionary; otherwise the expression
-    place: Place  # without constant factors
+    place: ReadExpression  # without constant factors
     weight: float  # the product of these and of the signs; NaN where it is not known
     conditions: tuple[Condition, ...] = ()
     replaces: bool = False  # what was added up before
@@ -67,18 +67,18 @@ class RewardReader:
         """Those whose two sides are summands of their own."""
         return self._differences if self.summands else []
 
-    def locate(self, place: Place) -> tuple[str, int]:
+    def locate(self, place: ReadExpression) -> tuple[str, int]:
         """Return file and line of an expression."""
         return self._files[place.function], place.node.lineno
 
-    def _list_rewards(self) -> Iterator[Place]:
+    def _list_rewards(self) -> Iterator[ReadExpression]:
         step = self.definitions.find_function("step")
         for node in ast.walk(step) if step is not None and not self.weights else ():
             if isinstance(node, ast.Return) and node.value is not None and step is not None:
-                for whole in self._list_tuples(Place(node.value, step, {})):
+                for whole in self._list_tuples(ReadExpression(node.value, step, {})):
                     yield whole.at(whole.node.elts[1])  # type: ignore[attr-defined]
 
-    def _list_tuples(self, place: Place) -> Iterator[Place]:
+    def _list_tuples(self, place: ReadExpression) -> Iterator[ReadExpression]:
         if isinstance(place.node, ast.Tuple):
             if len(place.node.elts) in (4, 5):
                 yield place
@@ -86,15 +86,15 @@ class RewardReader:
             for one in self.definitions.follow(place):
                 yield from self._list_tuples(one)
 
-    def _list_terms(self) -> Iterator[tuple[str, Place, tuple[Condition, ...]]]:
+    def _list_terms(self) -> Iterator[tuple[str, ReadExpression, tuple[Condition, ...]]]:
         for name in REWARD_METHODS if self.weights else ():
             method = self.definitions.find_function(name)
             for node in ast.walk(method) if method is not None else ():
                 if isinstance(node, ast.Return) and node.value is not None and method is not None:
-                    yield from self._list_entries(Place(node.value, method, {}))
+                    yield from self._list_entries(ReadExpression(node.value, method, {}))
 
     def _expand(
-        self, place: Place, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool = False
+        self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool = False
     ) -> Iterator[Summand]:
         if place.depth > DEEPEST:
             return
@@ -131,7 +131,7 @@ class RewardReader:
                 yield Summand(name or ast.unparse(place.node), place, weight, conditions, replaces)
 
     def _expand_name(
-        self, place: Place, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
+        self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
     ) -> Iterator[Summand]:
         own = name or read_name(place.node)
         if "reward" in split_name(own):
@@ -169,7 +169,7 @@ class RewardReader:
         return tuple(found)
 
     def _expand_sum(
-        self, place: Place, call: ast.Call, weight: float, conditions: tuple[Condition, ...]
+        self, place: ReadExpression, call: ast.Call, weight: float, conditions: tuple[Condition, ...]
     ) -> Iterator[Summand]:
         for inner in call.args[:1]:
             if isinstance(inner, ast.Call) and isinstance(inner.func, ast.Name) and inner.func.id == "list":
@@ -185,7 +185,7 @@ class RewardReader:
                     yield from self._expand_over(place, loop.target, loop.iter, elt, weight, conditions) or ()
 
     def _expand_loop(
-        self, place: Place, one: Assigned, weight: float, conditions: tuple[Condition, ...]
+        self, place: ReadExpression, one: Assigned, weight: float, conditions: tuple[Condition, ...]
     ) -> Iterator[Summand] | None:
         """Return the summands of a loop through a dictionary that adds each entry."""
         node: ast.AST = one.statement
@@ -197,7 +197,7 @@ class RewardReader:
 
     def _expand_over(
         self,
-        place: Place,
+        place: ReadExpression,
         target: ast.expr,
         through: ast.expr,
         elt: ast.expr,
@@ -217,8 +217,8 @@ class RewardReader:
 
     def _weigh_entries(
         self,
-        place: Place,
-        entries: Sequence[tuple[str, Place, tuple[Condition, ...]]],
+        place: ReadExpression,
+        entries: Sequence[tuple[str, ReadExpression, tuple[Condition, ...]]],
         dictionary: ast.expr,
         names: set[str],
         elt: ast.expr,
@@ -248,7 +248,7 @@ class RewardReader:
                 return float(values[order])  # type: ignore[arg-type]
         return math.nan
 
-    def _list_entries(self, place: Place) -> Iterator[tuple[str, Place, tuple[Condition, ...]]]:
+    def _list_entries(self, place: ReadExpression) -> Iterator[tuple[str, ReadExpression, tuple[Condition, ...]]]:
         """Yield the keys of a dictionary, with their values, and where they are given."""
         if place.depth > DEEPEST:
             return
@@ -286,7 +286,7 @@ class RewardReader:
                 for part in self.definitions.follow(place):
                     yield from self._list_entries(part)
 
-    def _list_single(self, place: Place) -> Iterator[tuple[str, Place, tuple[Condition, ...]]]:
+    def _list_single(self, place: ReadExpression) -> Iterator[tuple[str, ReadExpression, tuple[Condition, ...]]]:
         """Yield what is assigned to single keys of a dictionary."""
         text = ast.unparse(place.node)
         for name, several in self.definitions.list_assigned(place.function).items():
