@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
+from rlctl.checking.angular_parts import find_angular_parts
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.paid_goals import find_angular_parts
 from rlctl.checking.records import ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
