@@ -55,6 +55,7 @@ class Source:
     """The modules of an environment's author: those of its classes, and of the same folder what they have imported."""
 
     def __init__(self, env: Any) -> None:
+        self.author = find_author(env)
         self.modules = _list_modules(env)
         self.trees: dict[str, ast.Module] = {}
         for module in self.modules:

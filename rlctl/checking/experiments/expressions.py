@@ -2,6 +2,7 @@
 that look at how numbers are computed."""
 
 import ast
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,8 @@ from rlctl.checking.expressions import ExpressionRecorder, NotedCall, Source, re
 from rlctl.checking.instance import Context, EnvironmentRaised
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
-from rlctl.checking.rule import NotApplicable
+from rlctl.checking.rule import NotApplicable, RuleFinding
+from rlctl.checking.summands import RewardReader
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
 from rlctl.checking.values import find_author, list_own_classes
 
@@ -75,14 +77,26 @@ class NotedEpisodes:
         """The steps of all episodes."""
         return [call for episode in self.episodes for call in episode[1:]]
 
+    @functools.cached_property
+    def reward(self) -> RewardReader:
+        """What is added up to the reward."""
+        author = self.source.author
+        weights = {} if hasattr(author, "step") else getattr(author, "reward_weights", {})  # of a task
+        return RewardReader(self.source, self.steps, weights)
 
+
+BY_EXPRESSIONS = "findings by expressions"
+"""The fact with findings that count where a rule has found nothing else: they may show the same mistake."""
 judges_expressions = JudgeHook[NotedEpisodes]()
 """Shows the noted episodes of an instance."""
 
 
-@experiment("expressions", PROBE, 104, share=0.2, hooks=(judges_expressions,))
-def note_expressions(context: Context) -> Iterator[ChildMessage]:
-    """Play short episodes with functions that note their expressions."""
+@contextlib.contextmanager
+def noted_episodes(context: Context) -> Iterator[NotedEpisodes]:
+    """Play short episodes with functions that note their expressions, as long as this lasts.
+
+    Raises `NotApplicable` where there is no source.
+    """
     instance = context.instance
     source = Source(instance.env)
     if not source.expressions:
@@ -100,5 +114,14 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
                 episodes[-1].append(noted)
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
-        yield Fact(TIMED, find_timed_expressions(source, episodes))
-        yield from judges_expressions.judge(NotedEpisodes(source, episodes, context, recorder))
+        yield NotedEpisodes(source, episodes, context, recorder)
+
+
+@experiment("expressions", PROBE, 104, share=0.2, hooks=(judges_expressions,))
+def note_expressions(context: Context) -> Iterator[ChildMessage]:
+    """Show what was noted to all judges."""
+    with noted_episodes(context) as noted:
+        yield Fact(TIMED, find_timed_expressions(noted.source, noted.episodes))
+        shown = list(judges_expressions.judge(noted))
+    yield Fact(BY_EXPRESSIONS, [message for message in shown if isinstance(message, RuleFinding)])
+    yield from (message for message in shown if not isinstance(message, RuleFinding))

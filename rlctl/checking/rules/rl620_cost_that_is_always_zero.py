@@ -8,7 +8,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import ACTION_TERMS, WEIGHED_TERMS
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.previous_values import KeptDifferences
-from rlctl.checking.records import CheckedEpisode, Fact, Records
+from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     ENOUGH_STEPS,
     RAW_TERMS,
@@ -26,8 +26,8 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A reward term that is named after the actions, their change, or the effort of the motors, or that its
-        source computes from the action without a limit, is exactly 0 at every recorded step, although the
-        actions changed. It costs nothing, so nothing keeps the motions smooth or cheap. Terms whose name says
+        source computes from the action without a limit, is exactly 0 at every recorded step, although the actions
+        changed. It costs nothing, so nothing keeps the motions smooth or cheap. Terms whose name says
         that only a part counts, such as excess_torque, are not judged. An info in a plain environment, unless
         its source multiplies the term by a known number other than 0. So is a difference in the source between a
         value and what an attribute has kept of it, such as action - self.last_action, that is 0 in each step
@@ -40,25 +40,15 @@ RULE = Rule(
 )
 
 
-ZERO_DIFFERENCES = "differences that are always zero"
-
-
 @judges_expressions(RULE, decides=False)
-def _find_zero_differences(noted: NotedEpisodes) -> Iterator[Fact]:
-    found = []
+def _find_zero_differences(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in KeptDifferences(noted).find_always_zero():
         message = f"{one.whole.text} is 0 in all {len(noted.steps)} steps, although {one.new.text} changes:"
         message += f" {one.key} has been replaced by it before"
-        found.append(RuleFinding(RULE, message, {"term": one.whole.text, "value": 0.0}, where=one.whole.where))
-    yield Fact(ZERO_DIFFERENCES, found)
+        yield RuleFinding(RULE, message, {"term": one.whole.text, "value": 0.0}, where=one.whole.where)
 
 
-@judges_records(RULE, *WITH_SEARCH, "attributes", "expressions", of_absence=True)
-def _judge(records: Records) -> Iterator[RuleFinding]:
-    differences: list[RuleFinding] = records.facts.get(ZERO_DIFFERENCES, [])
-    yield from differences or _find_zero_costs(records)
-
-
+@judges_records(RULE, *WITH_SEARCH, "attributes", of_absence=True)
 def _find_zero_costs(records: Records) -> Iterator[RuleFinding]:
     episodes = require_terms(records)
     if _count_changes(episodes) < ENOUGH_STEPS:

@@ -6,13 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rlctl.checking.drawn_goals import Numbers, Source
-from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_draws import GoalDraws
 from rlctl.checking.goal_episodes import HELD_STEPS, PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.previous_values import KeptDifferences
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Records, Skipped
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -46,26 +45,15 @@ class _Switch(NamedTuple):
     noise: float  # how far these differ
 
 
-GOAL_JUMPS = "differences that jump with a new goal"
-
-
 @judges_expressions(RULE, decides=False)
-def _find_jumps(noted: NotedEpisodes) -> Iterator[Fact]:
-    found = []
+def _find_jumps(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in GoalDraws(KeptDifferences(noted)).find_jumps():
         difference = one.difference
         message = f"in the step after {one.key} has changed, {difference.whole.text} is up to {one.jump:.3g}, and at"
         message += f" most {one.usual:.3g} in nearly all other steps: {difference.key} is not computed again for the"
         message += f" new {one.key}, which comes if {one.test}; tried in {one.episodes} episodes"
         evidence = {"element": one.key, "value": one.jump, "expected": one.usual}
-        found.append(RuleFinding(RULE, message, evidence, where=difference.whole.where))
-    yield Fact(GOAL_JUMPS, found)
-
-
-@judges_records(RULE, "expressions")
-def _judge_jumps(records: Records) -> Iterator[RuleFinding]:
-    jumps: list[RuleFinding] = records.facts.get(GOAL_JUMPS, [])
-    yield from jumps
+        yield RuleFinding(RULE, message, evidence, where=difference.whole.where)
 
 
 @judges_goals(RULE)

@@ -11,7 +11,7 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.feet import find_feet, read_touches
 from rlctl.checking.first_contacts import find_endless_landings
-from rlctl.checking.records import Fact, Records
+from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import find_rates
 from rlctl.checking.term_names import is_about_landings, is_about_steps, is_paid
@@ -47,25 +47,15 @@ EXACT = 1e-6  # relative error of what is paid
 FEWEST_VALUES = 3  # different ones, of what landings pay
 
 
-LANDINGS = "landings in each step"
-
-
 @judges_expressions(RULE, decides=False)
-def _find_landings(noted: NotedEpisodes) -> Iterator[Fact]:
-    found = []
+def _find_landings(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in find_endless_landings(noted):
         message = f"{one.text} holds in all {one.stays} steps in which a contact goes on, since {one.key} has been"
         message += f" counted on to {one.time:.3g} before: each step on the ground counts as a landing"
-        found.append(RuleFinding(RULE, message, {"element": one.key, "value": one.time}, where=one.where))
-    yield Fact(LANDINGS, found)
+        yield RuleFinding(RULE, message, {"element": one.key, "value": one.time}, where=one.where)
 
 
-@judges_records(RULE, "attributes", "expressions")
-def _judge(records: Records) -> Iterator[RuleFinding]:
-    landings: list[RuleFinding] = records.facts.get(LANDINGS, [])
-    yield from landings or _find_paid_standing(records)
-
-
+@judges_records(RULE, "attributes")
 def _find_paid_standing(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
     terms = {name: values for name, values in log.infos.items() if is_paid(name) and is_about_steps(name)}

@@ -8,6 +8,8 @@ import numpy as np
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.paid_errors import ErrorReader
 from rlctl.checking.records import CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rewards import RAW_TERMS, TERMS, WITH_SEARCH, find_terms, has_terms, require_rewarded
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -25,7 +27,8 @@ RULE = Rule(
         A cost is the sum of actions, or of elements of the observation, with their signs: where they are negative it
         pays. The policy learns full reverse, or to swing to one side. Judged are terms in info['reward_terms'] that are
         such a sum in all steps and are named after a cost, or have a negative weight in a task; and lines of step that
-        subtract the plain sum of the action from the reward, where the action may be negative.
+        subtract the plain sum of the action from the reward, where the action may be negative, or any sum whose
+        numbers, and which itself, had both signs.
     """,
     fix="Sum squares or sizes: np.sum(np.square(action)), or np.sum(np.abs(action)).",
 )
@@ -187,3 +190,15 @@ def _is_sum(value: ast.expr, names: set[str]) -> bool:
         case ast.Call(func=ast.Name(id="float"), args=[only]):
             return _is_sum(only, names)
     return False
+
+
+@judges_expressions(RULE, decides=False)
+def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Yield the first cost of the source that is a sum with signs, by what it was worth."""
+    for summand, place in ErrorReader(notes).find_sums():
+        paid = summand.weight * notes.reward.list_values(place.node)
+        message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} adds up numbers with their"
+        message += f" signs: it costs up to {-paid.min():.4g} and pays up to {paid.max():.4g}"
+        evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(place))
+        return

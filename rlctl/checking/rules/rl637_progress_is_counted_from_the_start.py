@@ -2,10 +2,8 @@
 
 from collections.abc import Iterator
 
-from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.previous_values import KeptDifferences
-from rlctl.checking.records import Fact, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -22,20 +20,10 @@ RULE = Rule(
     fix="Set the previous value in each step, after the reward is computed.",
 )
 
-FROM_THE_START = "differences to the start"
-
 
 @judges_expressions(RULE, decides=False)
-def _find_differences(noted: NotedEpisodes) -> Iterator[Fact]:
-    found = []
+def _find_differences(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in KeptDifferences(noted).find_never_replaced():
         message = f"{one.key} stays what it was at the start in {len(noted.steps)} steps, and each of them pays"
         message += f" {one.whole.text}: not what has changed in the step, but since the start or the last goal"
-        found.append(RuleFinding(RULE, message, {"element": one.key}, where=one.whole.where))
-    yield Fact(FROM_THE_START, found)
-
-
-@judges_records(RULE, "expressions")
-def _judge(records: Records) -> Iterator[RuleFinding]:
-    differences: list[RuleFinding] = records.facts.get(FROM_THE_START, [])
-    yield from differences
+        yield RuleFinding(RULE, message, {"element": one.key}, where=one.whole.where)

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.action_trials import REWARD, Frame, Trials
-from rlctl.checking.experiment import INSTANCES, experiment, judges_records
+from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.goal_draws import GoalDraws
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.previous_values import KeptDifferences
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage, Fact, Records
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.stale_values import StaleValues
 from rlctl.checking.term_names import is_place
@@ -33,7 +33,6 @@ RULE = Rule(
     fix="Choose the goal in one place, which the observation, the reward and the success read.",
 )
 
-STALE_COPIES = "stale copies of goals"
 MOST_GOALS, MOST_GROUPS = 6, 3
 LONGEST = 400  # steps of an episode that are compared
 FEWEST = 10  # steps in a row; a reward may belong to the goal that was seen before the step
@@ -41,19 +40,11 @@ SAME = 1e-6  # differences that do not count, of the numbers or of 1
 
 
 @judges_expressions(RULE, decides=False)
-def _find_stale_copies(noted: NotedEpisodes) -> Iterator[Fact]:
-    found = []
+def _find_stale_copies(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in StaleValues(GoalDraws(KeptDifferences(noted))).find_stale_copies():
         message = f"reset copies {one.goal} into {one.copy}, which steps still read after {one.goal} has changed:"
         message += f" {one.read.text} is then that of the last {one.goal}"
-        found.append(RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where))
-    yield Fact(STALE_COPIES, found)
-
-
-@judges_records(RULE, "expressions")
-def _judge_copies(records: Records) -> Iterator[RuleFinding]:
-    copies: list[RuleFinding] = records.facts.get(STALE_COPIES, [])
-    yield from copies
+        yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
 
 
 @dataclasses.dataclass(frozen=True)
