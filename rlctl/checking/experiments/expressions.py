@@ -10,7 +10,9 @@ from rlctl.checking.expressions import NotedCall, Source, record_expressions
 from rlctl.checking.instance import Context
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
+from rlctl.checking.source_mistakes import MISTAKES, SourceMistake
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
+from rlctl.checking.turned_expressions import Series, find_wrong_turns
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
@@ -56,4 +58,10 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
     yield Fact(TIMED, find_timed_expressions(source, episodes))
+    yield Fact(MISTAKES, list(_find_mistakes(NotedEpisodes(source, episodes))))
     yield from judges_expressions.judge(NotedEpisodes(source, episodes))
+
+
+def _find_mistakes(noted: NotedEpisodes) -> Iterator[SourceMistake]:
+    """Yield the mistakes of lines, for the rules that other experiments judge, too."""
+    yield from find_wrong_turns(Series(noted.source, noted.episodes))
