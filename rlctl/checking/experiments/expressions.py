@@ -4,6 +4,9 @@ that look at how numbers are computed."""
 import dataclasses
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
+from rlctl.checking.compared_ids import find_doubled_ids, find_wrong_ids
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.expressions import NotedCall, Source, record_expressions
@@ -13,6 +16,7 @@ from rlctl.checking.rule import NotApplicable
 from rlctl.checking.source_mistakes import MISTAKES, SourceMistake
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
 from rlctl.checking.turned_expressions import Series, find_wrong_turns
+from rlctl.checking.unread_actions import find_unread_elements
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
@@ -58,10 +62,16 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
             if recorder.total > MOST_NOTED or context.budget.is_over():
                 break
     yield Fact(TIMED, find_timed_expressions(source, episodes))
-    yield Fact(MISTAKES, list(_find_mistakes(NotedEpisodes(source, episodes))))
+    size = int(np.prod(getattr(instance.env.action_space, "shape", None) or 0))
+    yield Fact(MISTAKES, list(_find_mistakes(NotedEpisodes(source, episodes), size)))
     yield from judges_expressions.judge(NotedEpisodes(source, episodes))
 
 
-def _find_mistakes(noted: NotedEpisodes) -> Iterator[SourceMistake]:
-    """Yield the mistakes of lines, for the rules that other experiments judge, too."""
-    yield from find_wrong_turns(Series(noted.source, noted.episodes))
+def _find_mistakes(noted: NotedEpisodes, size: int) -> Iterator[SourceMistake]:
+    """Yield the mistakes of lines, for the rules that other experiments judge, too; the action has `size` numbers."""
+    source, numbers = noted.source, {number for call in noted.steps for number in call.values}
+    evaluated = {source.expressions[number].function for number in numbers}
+    yield from find_wrong_turns(Series(source, noted.episodes))
+    yield from find_wrong_ids(source, noted.episodes)
+    yield from find_doubled_ids(source, evaluated)
+    yield from find_unread_elements(source, evaluated, size)

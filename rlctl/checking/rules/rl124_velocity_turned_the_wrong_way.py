@@ -26,13 +26,13 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Three elements of the observation are the velocity of a free body, turned by its orientation in the wrong
-        direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both
-        velocities of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its
-        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction
-        that reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an
-        engine is read from its attributes: its velocity is what changes its position, its frame the one in which its
-        actions push it, or the orientation that its angular velocity turns. Or a line of the source does so: it turns
-        a vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse, with a
+        direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both velocities
+        of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its angular
+        velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction that
+        reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an engine is
+        read from its attributes: its velocity is what changes its position, its frame the one in which its actions
+        push it, or the orientation that its angular velocity turns. Or a line of the source does so: it turns a
+        vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse, with a
         way in the world.
     """,
     fix="""

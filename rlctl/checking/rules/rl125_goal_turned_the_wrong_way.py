@@ -25,8 +25,9 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The observation has the way to a goal, turned by the orientation of a body, or by its yaw, in the wrong
-        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how
-        it is turned, or a line of the source turns the way by the orientation itself. A policy that does not see the heading too cannot learn where the goal is.
+        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how it
+        is turned, or a line of the source turns the way by the orientation itself. A policy that does not see the
+        heading too cannot learn where the goal is.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v); by a yaw
@@ -46,7 +47,7 @@ class _Frame(NamedTuple):
     link: Link
 
 
-@judges_records(RULE, "goals", "expressions")
+@judges_records(RULE, "expressions")
 def _judge_source(records: Records) -> Iterator[RuleFinding]:
     yield from report_mistakes(records, RULE)
 

@@ -18,6 +18,7 @@ from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity, list_others
 from rlctl.checking.step_times import StepTimes, require_step_times
 from rlctl.checking.term_names import split_name
+from rlctl.checking.timed_expressions import Use, find_wrong_time
 from rlctl.checking.told_speeds import (
     ToldSpeed,
     find_told_speeds,
@@ -25,7 +26,6 @@ from rlctl.checking.told_speeds import (
     read_engine_ways,
     read_told,
 )
-from rlctl.checking.timed_expressions import Use, find_wrong_time
 from rlctl.checking.transitions import name_floats
 from rlctl.checking.worlds import Array
 
