@@ -4,6 +4,7 @@ import ast
 import collections
 import functools
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from rlctl.checking.expressions import Function, NotedCall, Source
 from rlctl.checking.source_mistakes import SourceMistake
@@ -24,30 +25,65 @@ class Ids:
         self.source = source
 
     @functools.cached_property
-    def _assigned(self) -> Mapping[str, Sequence[ast.expr]]:
-        """What is assigned to names and attributes, in all of the source."""
-        found = collections.defaultdict[str, list[ast.expr]](list)
+    def _assigned(self) -> Mapping[tuple[object, str], Sequence[ast.expr]]:
+        """What is assigned to the names of each function, and to the attributes of each class."""
+        found = collections.defaultdict[tuple[object, str], list[ast.expr]](list)
         for tree in self.source.trees.values():
             for node in ast.walk(tree):
                 match node:
                     case ast.Assign(targets=targets, value=value):
                         for target in targets:
                             self._add(found, target, value)
-                    case (
-                        ast.AnnAssign(target=target, value=ast.expr() as value)
-                        | ast.NamedExpr(target=target, value=value)
-                    ):
+                    case ast.AnnAssign(target=target, value=ast.expr() as value):
                         self._add(found, target, value)
                     case ast.For(target=target, iter=value) | ast.comprehension(target=target, iter=value):
                         self._add(found, *_open_loop(target, value))
         return found
 
-    def _add(self, found: dict[str, list[ast.expr]], target: ast.expr, value: ast.expr) -> None:
+    def _add(self, found: dict[tuple[object, str], list[ast.expr]], target: ast.expr, value: ast.expr) -> None:
         if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
             for one, part in zip(target.elts, value.elts, strict=True):
                 self._add(found, one, part)
-        elif isinstance(target, ast.Name | ast.Attribute):
-            found[ast.unparse(target)].append(value)
+        elif isinstance(target, ast.Name):
+            found[self._find_owner(target, Function), target.id].append(value)
+        elif isinstance(target, ast.Attribute):
+            found[self._name_class(target), ast.unparse(target)].append(value)
+
+    def _find_owner(self, node: ast.AST, kind: Any) -> ast.AST | None:
+        owner: ast.AST | None = node
+        while owner is not None and not isinstance(owner, kind):
+            owner = self.source.parents.get(owner)
+        return owner
+
+    def _name_class(self, node: ast.AST) -> str:
+        owner = self._find_owner(node, ast.ClassDef)
+        return owner.name if isinstance(owner, ast.ClassDef) else ""
+
+    def _list_classes(self, node: ast.AST) -> list[str]:
+        """Return the class in which a piece of code stands; of the environment's own, all."""
+        name = self._name_class(node)
+        return self.source.classes if name in self.source.classes else [name]
+
+    def _read_assigned(self, node: ast.expr) -> Sequence[ast.expr]:
+        """Return what is assigned to a name or an attribute; empty for any other expression."""
+        text = ast.unparse(node)
+        if isinstance(node, ast.Name):
+            return self._assigned.get((self._find_owner(node, Function), text), ())
+        owners = self._list_classes(node) if isinstance(node, ast.Attribute) else []
+        return [value for owner in owners for value in self._assigned.get((owner, text), ())]
+
+    def _list_returned(self, function: ast.expr) -> list[ast.expr]:
+        """Return what an own method, or a function of the source, returns."""
+        name = function.attr if isinstance(function, ast.Attribute) else ast.unparse(function)
+        is_method = isinstance(function, ast.Attribute) and ast.unparse(function.value) == "self"
+        if isinstance(function, ast.Attribute) and not is_method:
+            return []
+        for owner in self._list_classes(function) if is_method else [""]:
+            for one in self.source.functions.get(name, ()):
+                if self._name_class(one) == owner:
+                    returns = [node for node in ast.walk(one) if isinstance(node, ast.Return)]
+                    return [node.value for node in returns if node.value is not None]
+        return []
 
     def find(self, node: ast.expr, depth: int = 0) -> set[str]:
         """Return the kinds of an expression, or of what it holds; empty for what is not known."""
@@ -78,14 +114,18 @@ class Ids:
             ):
                 return self.find(part, depth + 1)
             case ast.Name() | ast.Attribute():
-                values = self._assigned.get(ast.unparse(node), ())
-                found = [self.find(value, depth + 1) for value in values]
-                return set().union(*found) if found and all(found) else set()
+                return self._unite(self._read_assigned(node), depth)
+            case ast.Call(func=function):
+                return self._unite(self._list_returned(function), depth)
         return set()
+
+    def _unite(self, values: Sequence[ast.expr], depth: int) -> set[str]:
+        found = [self.find(value, depth + 1) for value in values]
+        return set[str]().union(*found) if found and all(found) else set()
 
     def is_point(self, node: ast.expr) -> bool:
         """Say whether a name goes through the contact points of PyBullet."""
-        values = self._assigned.get(ast.unparse(node), ()) if isinstance(node, ast.Name) else ()
+        values = self._read_assigned(node) if isinstance(node, ast.Name) else ()
         return bool(values) and all(self._lists_points(value) for value in values)
 
     def _lists_points(self, node: ast.expr, depth: int = 0) -> bool:
@@ -95,7 +135,7 @@ class Ids:
             case ast.BoolOp(values=[first, *_]):
                 return self._lists_points(first, depth)
             case ast.Name() | ast.Attribute() if depth < DEEPEST:
-                values = self._assigned.get(ast.unparse(node), ())
+                values = self._read_assigned(node)
                 return bool(values) and all(self._lists_points(value, depth + 1) for value in values)
         return False
 
@@ -121,14 +161,17 @@ def find_wrong_ids(source: Source, episodes: Sequence[Sequence[NotedCall]]) -> I
         left, right = one.node.left, one.node.comparators[0]
         values = [value for episode in episodes for call in episode for value in call.values.get(one.number, ())]
         if isinstance(one.node.ops[0], ast.Eq | ast.NotEq | ast.In | ast.NotIn):
-            kinds = [ids.find(side) for side in (left, right)]
-            for mine, other, side in ((kinds[0], kinds[1], right), (kinds[1], kinds[0], left)):
-                if _is_of_contact(mine) and other and not mine & other and len(values) >= FEWEST:
-                    (theirs,) = mine
-                    message = f"{one.text} compares the {theirs} of a contact with {ast.unparse(side)}, which is the id"
-                    message += f" of a {sorted(other)[0]}: ids of different kinds have nothing to do with each other"
-                    yield SourceMistake("RL834", message, {"element": one.text, "value": sorted(other)}, one.where)
-                    break
+            for contact, others in ((left, right), (right, left)):
+                theirs = ids.find(contact)
+                for other in _open_literal(others) if theirs in ({"geom"}, {"link"}) and len(values) >= FEWEST else ():
+                    wrong = sorted(ids.find(other) - theirs)
+                    if not wrong or ids.find(other) & theirs:
+                        continue
+                    message = (
+                        f"{one.text} compares the id of a contact's {min(theirs)} with {ast.unparse(other)}, which is"
+                    )
+                    message += f" that of a {wrong[0]}: ids of different kinds have nothing to do with each other"
+                    yield SourceMistake("RL834", message, {"element": one.text, "value": wrong}, one.where)
         match left, one.node.ops[0]:
             case ast.Subscript(value=owner, slice=ast.Constant(value=8)), ast.Gt() | ast.GtE() if ids.is_point(owner):
                 if len(values) >= FEWEST and not any(values):
@@ -139,15 +182,15 @@ def find_wrong_ids(source: Source, episodes: Sequence[Sequence[NotedCall]]) -> I
                     yield SourceMistake("RL834", message, {"element": one.text, "value": len(values)}, one.where)
 
 
-def _is_of_contact(kinds: set[str]) -> bool:
-    return kinds in ({"geom"}, {"link"})
+def _open_literal(node: ast.expr) -> list[ast.expr]:
+    return node.elts if isinstance(node, ast.Set | ast.Tuple | ast.List) else [node]
 
 
 def find_doubled_ids(source: Source, evaluated: set[Function]) -> Iterator[SourceMistake]:
     """Yield lists in which one part is looked up twice by its name, in classes whose functions were evaluated."""
     for file, tree in source.trees.items():
         classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-        own = [one for one in classes if not evaluated.isdisjoint(one.body)]  # type: ignore[arg-type]
+        own = [one for one in classes if one.name in source.classes or evaluated & set(one.body)]
         for node in (node for one in own for node in ast.walk(one)):
             if not isinstance(node, ast.List | ast.Tuple) or len(node.elts) < 2:
                 continue

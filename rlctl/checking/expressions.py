@@ -56,6 +56,8 @@ class Source:
 
     def __init__(self, env: Any) -> None:
         self.modules = _list_modules(env)
+        self.classes = [cls.__name__ for cls in list_own_classes(find_author(env))]
+        """The author's classes of the environment, the most derived first."""
         self.trees: dict[str, ast.Module] = {}
         for module in self.modules:
             with contextlib.suppress(OSError, SyntaxError, ValueError):

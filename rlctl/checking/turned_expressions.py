@@ -106,6 +106,11 @@ class Turn:
     before: Array
     after: Array
 
+    @property
+    def turned_back(self) -> "Turn":
+        """The opposite turn."""
+        return dataclasses.replace(self, before=self.after, after=self.before)
+
 
 def find_turns(series: Series) -> Iterator[Turn]:
     """Yield the expressions whose value is as long as one of its operands or arguments, and another vector."""
@@ -332,7 +337,7 @@ class WorldVectors:
             return "a direction that stays the same in an episode"
         if turn.whole.function in self._watchers and (way := self._find_way(turn)) is not None:
             return f"the way {way}"
-        if turn.text.replace(" ", "").endswith(("qvel[:3]", "qvel[0:3]")) or self._is_velocity(turn):
+        if turn.text.replace(" ", "").endswith(("qvel[:3]", "qvel[0:3]")) or self.is_velocity(turn):
             return "the velocity that moves a position"
         return None
 
@@ -422,7 +427,7 @@ class WorldVectors:
                         return text
         return None
 
-    def _is_velocity(self, turn: Turn) -> bool:
+    def is_velocity(self, turn: Turn) -> bool:
         """Say whether a position moves along the vector, and not along what it is turned into."""
         size, steps = turn.before.shape[2], np.diff(self.series.episodes) == 0
         for one, rows in self.series.vectors:
@@ -461,6 +466,7 @@ def find_wrong_turns(series: Series) -> Iterator[SourceMistake]:
     known = [(turn, directions.find(turn)) for turn in turns]
     explained = [(turn, found, world.explain(turn)) for turn, found in known if found is not None]
     rights = {found[1] for _, found, what in explained if found[0] < 0 and what is not None}
+    rights |= {found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)}
     seen, rights_3d = set[int](), {one.text for one in series.orientations}
     for turn, by in ((turn, found[1]) for turn, found in known if found is not None and found[0] < 0):
         if by in rights_3d and (other := world.find_compared(turn)) is not None:

@@ -147,7 +147,8 @@ def _is_harmless(source: Source, node: ast.expr, names: list[str]) -> bool:
             case ast.Assign(targets=[ast.Name(id=target)]):
                 return target in names or bool(set(split_name(target)) & OLD_WORDS)
             case ast.Assign(targets=[target]):
-                return bool(set(split_name(ast.unparse(target))) & OLD_WORDS)
+                name = ast.unparse(target)
+                return bool(set(split_name(name)) & OLD_WORDS) and not _is_indexed(source, name)
             case ast.AugAssign():
                 return False
             case ast.stmt():
@@ -165,4 +166,17 @@ def _name(node: ast.AST) -> str:
 
 
 def _count_statements(source: Source, nodes: list[ast.Subscript]) -> int:
-    return len({source.find_statement(node) for node in nodes})
+    """Return in how many statements, or entries of a list, something is read."""
+    places = set[ast.AST]()
+    for node in nodes:
+        place: ast.AST = node
+        while not isinstance(place, ast.stmt) and not isinstance(source.parents[place], ast.Tuple | ast.List):
+            place = source.parents[place]
+        places.add(place)
+    return len(places)
+
+
+def _is_indexed(source: Source, attribute: str) -> bool:
+    """Say whether single elements of an attribute are read anywhere."""
+    nodes = (node for tree in source.trees.values() for node in ast.walk(tree))
+    return any(isinstance(node, ast.Subscript) and ast.unparse(node.value) == attribute for node in nodes)
