@@ -2,10 +2,9 @@
 
 import ast
 import collections
-import functools
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
+from rlctl.checking.assignments import Assignments
 from rlctl.checking.expressions import Function, NotedCall, Source
 from rlctl.checking.source_mistakes import SourceMistake
 from rlctl.checking.term_names import split_name
@@ -21,69 +20,8 @@ DEEPEST = 6  # assignments that are followed
 class Ids:
     """Of which kind the ids are that expressions hold: those of geoms, bodies, joints, sites, actuators, or links."""
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
-
-    @functools.cached_property
-    def _assigned(self) -> Mapping[tuple[object, str], Sequence[ast.expr]]:
-        """What is assigned to the names of each function, and to the attributes of each class."""
-        found = collections.defaultdict[tuple[object, str], list[ast.expr]](list)
-        for tree in self.source.trees.values():
-            for node in ast.walk(tree):
-                match node:
-                    case ast.Assign(targets=targets, value=value):
-                        for target in targets:
-                            self._add(found, target, value)
-                    case ast.AnnAssign(target=target, value=ast.expr() as value):
-                        self._add(found, target, value)
-                    case ast.For(target=target, iter=value) | ast.comprehension(target=target, iter=value):
-                        self._add(found, *_open_loop(target, value))
-        return found
-
-    def _add(self, found: dict[tuple[object, str], list[ast.expr]], target: ast.expr, value: ast.expr) -> None:
-        if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
-            for one, part in zip(target.elts, value.elts, strict=True):
-                self._add(found, one, part)
-        elif isinstance(target, ast.Name):
-            found[self._find_owner(target, Function), target.id].append(value)
-        elif isinstance(target, ast.Attribute):
-            found[self._name_class(target), ast.unparse(target)].append(value)
-
-    def _find_owner(self, node: ast.AST, kind: Any) -> ast.AST | None:
-        owner: ast.AST | None = node
-        while owner is not None and not isinstance(owner, kind):
-            owner = self.source.parents.get(owner)
-        return owner
-
-    def _name_class(self, node: ast.AST) -> str:
-        owner = self._find_owner(node, ast.ClassDef)
-        return owner.name if isinstance(owner, ast.ClassDef) else ""
-
-    def _list_classes(self, node: ast.AST) -> list[str]:
-        """Return the class in which a piece of code stands; of the environment's own, all."""
-        name = self._name_class(node)
-        return self.source.classes if name in self.source.classes else [name]
-
-    def _read_assigned(self, node: ast.expr) -> Sequence[ast.expr]:
-        """Return what is assigned to a name or an attribute; empty for any other expression."""
-        text = ast.unparse(node)
-        if isinstance(node, ast.Name):
-            return self._assigned.get((self._find_owner(node, Function), text), ())
-        owners = self._list_classes(node) if isinstance(node, ast.Attribute) else []
-        return [value for owner in owners for value in self._assigned.get((owner, text), ())]
-
-    def _list_returned(self, function: ast.expr) -> list[ast.expr]:
-        """Return what an own method, or a function of the source, returns."""
-        name = function.attr if isinstance(function, ast.Attribute) else ast.unparse(function)
-        is_method = isinstance(function, ast.Attribute) and ast.unparse(function.value) == "self"
-        if isinstance(function, ast.Attribute) and not is_method:
-            return []
-        for owner in self._list_classes(function) if is_method else [""]:
-            for one in self.source.functions.get(name, ()):
-                if self._name_class(one) == owner:
-                    returns = [node for node in ast.walk(one) if isinstance(node, ast.Return)]
-                    return [node.value for node in returns if node.value is not None]
-        return []
+    def __init__(self, assignments: Assignments) -> None:
+        self._assignments = assignments
 
     def find(self, node: ast.expr, depth: int = 0) -> set[str]:
         """Return the kinds of an expression, or of what it holds; empty for what is not known."""
@@ -114,9 +52,9 @@ class Ids:
             ):
                 return self.find(part, depth + 1)
             case ast.Name() | ast.Attribute():
-                return self._unite(self._read_assigned(node), depth)
+                return self._unite(self._assignments.read(node), depth)
             case ast.Call(func=function):
-                return self._unite(self._list_returned(function), depth)
+                return self._unite(self._assignments.list_returned(function), depth)
         return set()
 
     def _unite(self, values: Sequence[ast.expr], depth: int) -> set[str]:
@@ -125,7 +63,7 @@ class Ids:
 
     def is_point(self, node: ast.expr) -> bool:
         """Say whether a name goes through the contact points of PyBullet."""
-        values = self._read_assigned(node) if isinstance(node, ast.Name) else ()
+        values = self._assignments.read(node) if isinstance(node, ast.Name) else ()
         return bool(values) and all(self._lists_points(value) for value in values)
 
     def _lists_points(self, node: ast.expr, depth: int = 0) -> bool:
@@ -135,7 +73,7 @@ class Ids:
             case ast.BoolOp(values=[first, *_]):
                 return self._lists_points(first, depth)
             case ast.Name() | ast.Attribute() if depth < DEEPEST:
-                values = self._read_assigned(node)
+                values = self._assignments.read(node)
                 return bool(values) and all(self._lists_points(value, depth + 1) for value in values)
         return False
 
@@ -144,17 +82,9 @@ class Ids:
         return bool({"contact", "contacts", "con", "c"} & set(split_name(ast.unparse(node).rsplit(".", 1)[-1])))
 
 
-def _open_loop(target: ast.expr, value: ast.expr) -> tuple[ast.expr, ast.expr]:
-    """Return what is one element of a loop's values, and these; enumerate has a number before each."""
-    match target, value:
-        case ast.Tuple(elts=[_, element]), ast.Call(func=ast.Name(id="enumerate"), args=[inner, *_]):
-            return element, inner
-    return target, value
-
-
 def find_wrong_ids(source: Source, episodes: Sequence[Sequence[NotedCall]]) -> Iterator[SourceMistake]:
     """Yield comparisons of the ids of contacts with those of another kind, and of a distance that is never so large."""
-    ids = Ids(source)
+    ids = Ids(Assignments(source))
     for one in source.expressions:
         if not isinstance(one.node, ast.Compare):
             continue

@@ -5,6 +5,7 @@ import collections
 import dataclasses
 import functools
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -32,6 +33,7 @@ INVERSE_WORDS = {"inv", "inverse", "invert", "conj", "conjugate", "transpose"}
 WATCH_WORDS = {"obs", "observe", "observation", "observations", "state", "sense", "features"}
 WORLD_WORDS = {"world", "global", "inertial", "map"}
 ANGLE_WORDS = {"yaw", "heading", "theta", "psi", "course", "euler", "rpy", "joint", "joints", "angle", "qpos", "turn"}
+FREE_VELOCITY = r"qvel\[0?:3\](\.copy\(\)|\.astype\([^)]*\)|\))*$"
 MATRIX_WORDS = {"xmat", "site_xmat", "geom_xmat", "ximat"}
 WXYZ, XYZW = [1, 2, 3, 0], [0, 1, 2, 3]
 """Where the elements x, y, z and w are."""
@@ -39,7 +41,7 @@ SAME = 1e-6
 FEWEST, NEARLY_ALL, MOSTLY, HARDLY_ANY = 10, 0.95, 0.7, 0.3
 MOST_CALLS = 60  # in which orientations are compared
 LEAST_SPREAD = 0.1  # of an angle [rad], standard deviation
-LEAST_TURN = 0.05  # of a vector's length, that a turn moves it
+LEAST_TURN = 0.002  # of a vector's length, that a turn moves it
 
 
 class Series:
@@ -81,7 +83,7 @@ class Series:
     @functools.cached_property
     def orientations(self) -> list[Expression]:
         """All expressions that are unit quaternions, and change; and MuJoCo's matrices."""
-        found = [one for one in self.source.expressions if MATRIX_WORDS & _words(one.node) and self._is_matrix(one)]
+        found = [one for one in self.source.expressions if MATRIX_WORDS & list_words(one.node) and self._is_matrix(one)]
         for one in self.source.expressions:
             rows = self.read(one.node, size=4)
             if rows is not None and np.isfinite(rows).any():
@@ -90,6 +92,13 @@ class Series:
                 if len(lengths) >= FEWEST and np.abs(lengths - 1).max() < 1e-4 and moves > SAME:
                     found.append(one)
         return found
+
+    def read_matrices(self, one: Expression) -> Array | None:
+        """Return the matrices of an expression that has nine elements, (calls, 3, 3); None for others."""
+        if not self._is_matrix(one):
+            return None
+        values = [last.get(one.number) for last in self._last]
+        return np.array([np.full(9, np.nan) if v is None else np.ravel(v) for v in values]).reshape(-1, 3, 3)
 
     def _is_matrix(self, one: Expression) -> bool:
         values = [last[one.number] for last in self._last if one.number in last]
@@ -207,12 +216,10 @@ class Directions:
 
     def __init__(self, series: Series) -> None:
         self.series = series
-        self.has_engine = any(
-            isinstance(node, ast.Import | ast.ImportFrom)
-            and {"mujoco", "pybullet", "rlctl"} & set(ast.unparse(node).replace(".", " ").split())
-            for tree in series.source.trees.values()
-            for node in ast.walk(tree)
-        )
+        nodes = (node for tree in series.source.trees.values() for node in ast.walk(tree))
+        imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+        self._libraries = {word for node in imports for word in ast.unparse(node).replace(".", " ").split()}
+        self.has_engine = bool(self._libraries & {"mujoco", "pybullet", "rlctl"})
 
     def find(self, turn: Turn) -> tuple[int, str] | None:
         """Return 1 for a turn from the body to the world, -1 for the inverse, and by what; None where it is not
@@ -282,12 +289,24 @@ class Directions:
                     found.append((_rank(one), sign, one.text))
         return _choose(found)
 
+    def read_yaw(self, text: str) -> Array | None:
+        """Return the angle about the vertical of an orientation that `find` has named: (calls, worlds)."""
+        for one in (one for one in self.series.orientations if one.text == text):
+            if (matrices := self.series.read_matrices(one)) is not None:
+                return np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])[:, None]
+            rows = self.series.read(one.node, size=4)
+            if rows is not None:
+                order = WXYZ if "mujoco" in self._libraries else XYZW
+                yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
+                return yaw.reshape(rows.shape[:2])
+        return next((rows for one, rows in self._angles if one.text == text), None)
+
     @functools.cached_property
     def _angles(self) -> list[tuple[Expression, Array]]:
         """What is called an angle about the vertical, and is no argument: that may be another one's opposite."""
         kinds = ast.Name | ast.Attribute | ast.Subscript | ast.Call
         named = [one for one in self.series.source.expressions if isinstance(one.node, kinds)]
-        named = [one for one in named if _words(one.node) & ANGLE_WORDS and _rank(one) < 2]
+        named = [one for one in named if list_words(one.node) & ANGLE_WORDS and _rank(one) < 2]
         found = [(one, self.series.read(one.node)) for one in named]
         return [(one, rows) for one, rows in found if rows is not None]
 
@@ -302,7 +321,7 @@ def _rank(one: Expression) -> int:
     """Return 0 for what is stored, 1 for what is read, and 2 for what may be the inverse of an orientation."""
     parameters = {argument.arg for argument in one.function.args.args} - {"self"}
     names = {node.id for node in ast.walk(one.node) if isinstance(node, ast.Name)}
-    if names & parameters or _words(one.node) & INVERSE_WORDS or isinstance(one.node, ast.BinOp | ast.UnaryOp):
+    if names & parameters or list_words(one.node) & INVERSE_WORDS or isinstance(one.node, ast.BinOp | ast.UnaryOp):
         return 2
     return 0 if isinstance(one.node, ast.Attribute | ast.Subscript) and "self" in names else 1
 
@@ -312,7 +331,7 @@ def _list_values(call: NotedCall, one: Expression) -> list[Value]:
     return values if len(values) <= 3 else [values[0], *values[-2:]]
 
 
-def _words(node: ast.AST) -> set[str]:
+def list_words(node: ast.AST) -> set[str]:
     """Return the words of all names in a piece of code."""
     names = [one.id for one in ast.walk(node) if isinstance(one, ast.Name)]
     names += [one.attr for one in ast.walk(node) if isinstance(one, ast.Attribute)]
@@ -328,16 +347,16 @@ class WorldVectors:
 
     def explain(self, turn: Turn) -> str | None:
         """Return what the vector is that is turned; None where it is not known to be one of the world."""
-        words = _words(turn.part) if turn.part is not None else set(split_name(turn.text))
+        words = list_words(turn.part) if turn.part is not None else set(split_name(turn.text))
         context = words | self._find_context(turn.whole.node)
         vectors = turn.before
-        if self._is_gravity(vectors) and context & GRAVITY_WORDS:
+        if self.is_gravity(vectors) and context & GRAVITY_WORDS:
             return "gravity"
         if words & DRAWN_WORDS and not words & OTHER_WORDS and self._is_drawn(vectors):
             return "a direction that stays the same in an episode"
-        if turn.whole.function in self._watchers and (way := self._find_way(turn)) is not None:
+        if turn.whole.function in self._watchers and (way := self.find_way(turn)) is not None:
             return f"the way {way}"
-        if turn.text.replace(" ", "").endswith(("qvel[:3]", "qvel[0:3]")) or self.is_velocity(turn):
+        if self.is_velocity(turn):
             return "the velocity that moves a position"
         return None
 
@@ -363,12 +382,12 @@ class WorldVectors:
             above = parents[node]
             if isinstance(above, ast.Dict):
                 keys = [k for k, v in zip(above.keys, above.values, strict=True) if v is node and k is not None]
-                return _words(keys[0]) if keys else set()
+                return list_words(keys[0]) if keys else set()
             node = above
         targets = node.targets if isinstance(node, ast.Assign) else []
-        return {word for target in targets for word in _words(target)}
+        return {word for target in targets for word in list_words(target)}
 
-    def _is_gravity(self, vectors: Array) -> bool:
+    def is_gravity(self, vectors: Array) -> bool:
         known = vectors[np.isfinite(vectors).all(axis=2)]
         return vectors.shape[2] == 3 and bool((known[:, :2] == 0).all() and (known[:, 2] < 0).all())
 
@@ -382,13 +401,13 @@ class WorldVectors:
             firsts += [rows[0]] if len(rows) else []
         return len(firsts) > 1 and float(np.ptp(np.array(firsts), axis=0).max()) > SAME
 
-    def _find_way(self, turn: Turn, *, needs_goal: bool = True) -> str | None:
+    def find_way(self, turn: Turn, *, needs_goal: bool = True) -> str | None:
         """Return the difference of places that a vector is, up to its length."""
         for one, rows in self.series.vectors:
             node = one.node
             if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Sub):
                 continue
-            words = _words(node)
+            words = list_words(node)
             if rows.shape != turn.before.shape or words & OTHER_WORDS or not words & PLACE_WORDS:
                 continue
             sides = [self.series.read(side, size=rows.shape[2]) for side in (node.left, node.right)]
@@ -404,6 +423,12 @@ class WorldVectors:
         firsts = [places[self.series.episodes == number][0] for number in np.unique(self.series.episodes)]
         is_drawn = len(firsts) > 1 and np.ptp(np.array(firsts), axis=0).max() > SAME
         return bool(stays.mean() > MOSTLY and is_drawn)
+
+    @functools.cached_property
+    def _has_free_joint(self) -> bool:
+        """Whether MuJoCo's first joint is a free one, as far as the source shows it."""
+        texts = [ast.unparse(tree) for tree in self.series.source.trees.values()]
+        return any(re.search(r"freejoint|type=.free|qpos\[3:7\]", text) for text in texts)
 
     def find_compared(self, turn: Turn) -> str | None:
         """Return the way of the world with which a turned axis of a body is multiplied, the vector being constant."""
@@ -423,15 +448,21 @@ class WorldVectors:
                     continue
                 if np.array_equal(turned, turn.after, equal_nan=True):
                     facing = dataclasses.replace(turn, before=way)
-                    if (text := self._find_way(facing, needs_goal=False)) is not None:
+                    if (text := self.find_way(facing, needs_goal=False)) is not None:
                         return text
         return None
 
     def is_velocity(self, turn: Turn) -> bool:
         """Say whether a position moves along the vector, and not along what it is turned into."""
+        if self._has_free_joint and re.search(FREE_VELOCITY, turn.text.replace(" ", "")):
+            return True
         size, steps = turn.before.shape[2], np.diff(self.series.episodes) == 0
         for one, rows in self.series.vectors:
-            if rows.shape != turn.before.shape or not _words(one.node) & PLACE_WORDS or isinstance(one.node, ast.BinOp):
+            if (
+                rows.shape != turn.before.shape
+                or not list_words(one.node) & PLACE_WORDS
+                or isinstance(one.node, ast.BinOp)
+            ):
                 continue
             moved = np.diff(rows, axis=0)[steps].reshape(-1, size)
             old, new = (vectors[1:][steps].reshape(-1, size) for vectors in (turn.before, turn.after))
@@ -479,7 +510,7 @@ def find_wrong_turns(series: Series) -> Iterator[SourceMistake]:
         if sign < 0 or what is None or turn.whole.number in seen:
             continue
         is_angle = turn.before.shape[2] == 2 or by not in rights_3d
-        is_told = bool(_words(turn.whole.node) & WORLD_WORDS) or by in rights or directions.has_engine
+        is_told = bool(list_words(turn.whole.node) & WORLD_WORDS) or by in rights or directions.has_engine
         if is_angle and not is_told:
             continue  # the angle may count the other way round, as that of a compass
         seen.add(turn.whole.number)

@@ -164,3 +164,32 @@ class RL701BargeCopied(Barge):
         thrust = action[0]
         side = action[1]
         return thrust, side, 0.5 * action[1]
+
+
+class Skiff(Barge):
+    """It does not observe its heading: all vectors are in its own frame."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = box(4)
+
+    def observe(self):
+        way = self.turn_way(np.array([self.goal_x - self.x, self.goal_y - self.y]))
+        velocity = self.turn(self.measure_velocity())
+        observation = np.zeros(4)
+        observation[:2] = way
+        observation[2:] = velocity
+        return (observation + self.np_random.normal(0, 0.02, 4)).astype(np.float32)
+
+    def measure_velocity(self):
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        return np.array([c * self.ahead - s * self.aside, s * self.ahead + c * self.aside])
+
+
+class RL129SkiffWayInTheWorld(Skiff):
+    def observe(self):
+        pos = np.array([self.x, self.y])
+        way = np.array([self.goal_x, self.goal_y]) - pos
+        velocity = self.turn(self.measure_velocity())
+        observation = np.concatenate((way, velocity))
+        return (observation + self.np_random.normal(0, 0.02, 4)).astype(np.float32)

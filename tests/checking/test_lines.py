@@ -1,12 +1,13 @@
-"""RL124, RL125, RL701, RL834 and RL835 by lines of the source: vectors turned, elements read, and ids compared."""
+"""RL124, RL125, RL129, RL701, RL834 and RL835 by lines of the source: vectors turned, elements read, and ids compared."""
 
 import pytest
 
 from tests.checking.judging import findings, found
 
 TURNED = ["RL124KiteDown", "RL124KiteNorth", "RL125KiteWay", "RL124KiteLens", "RL125BargeWay", "RL701BargeCopied"]
+TURNED += ["RL129SkiffWayInTheWorld"]
 COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLeftTwice", "RL835BipedTwoOfTheRight"]
-RULES = ["RL124", "RL125", "RL701", "RL834", "RL835"]
+RULES = ["RL124", "RL125", "RL129", "RL701", "RL834", "RL835"]
 
 
 @pytest.mark.slow
@@ -23,7 +24,9 @@ def test_a_line_compares_or_looks_up_the_wrong_ids(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["broken_lines.py:Kite", "broken_lines.py:Barge", "broken_ids.py:Biped"])
+@pytest.mark.parametrize(
+    "task", ["broken_lines.py:Kite", "broken_lines.py:Barge", "broken_lines.py:Skiff", "broken_ids.py:Biped"]
+)
 def test_their_twins_are_right(task):
     pytest.importorskip("mujoco")
     assert found(task, *RULES) == set()

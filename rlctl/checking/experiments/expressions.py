@@ -11,6 +11,7 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.expressions import NotedCall, Source, record_expressions
 from rlctl.checking.instance import Context
+from rlctl.checking.observed_frames import find_world_vectors
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.source_mistakes import MISTAKES, SourceMistake
@@ -71,7 +72,9 @@ def _find_mistakes(noted: NotedEpisodes, size: int) -> Iterator[SourceMistake]:
     """Yield the mistakes of lines, for the rules that other experiments judge, too; the action has `size` numbers."""
     source, numbers = noted.source, {number for call in noted.steps for number in call.values}
     evaluated = {source.expressions[number].function for number in numbers}
-    yield from find_wrong_turns(Series(source, noted.episodes))
+    series = Series(source, noted.episodes)
+    yield from find_wrong_turns(series)
+    yield from find_world_vectors(series)
     yield from find_wrong_ids(source, noted.episodes)
     yield from find_doubled_ids(source, evaluated)
     yield from find_unread_elements(source, evaluated, size)
