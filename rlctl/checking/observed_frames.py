@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rlctl.checking.assignments import Assignments
 from rlctl.checking.expressions import Function
 from rlctl.checking.source_mistakes import SourceMistake
-from rlctl.checking.turned_expressions import Directions, Series, Turn, WorldVectors, find_turns, list_words
+from rlctl.checking.turned_expressions import Series, Turn, TurnedVectors, WorldVectors, list_words
 
 Array = NDArray[np.float64]
 
@@ -50,13 +50,13 @@ class Observed:
     def nodes(self) -> list[ast.expr]:
         """All of them, as far as elements of the observation are their elements."""
         found: dict[ast.expr, None] = {}
-        for tree in self._series.source.trees.values():
-            for owner in ast.walk(tree):
-                if isinstance(owner, ast.ClassDef) and owner.name in self._series.source.classes:
-                    for function in owner.body:
-                        if isinstance(function, Function):
-                            for root in self._list_roots(function):
-                                self._visit(root, found, 0)
+        source = self._series.source
+        classes = [node for tree in source.trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+        own = sorted((one for one in classes if one.name in source.classes), key=lambda o: source.classes.index(o.name))
+        methods = [one for owner in reversed(own) for one in owner.body if isinstance(one, Function)]
+        for function in {one.name: one for one in methods}.values():
+            for root in self._list_roots(function):
+                self._visit(root, found, 0)
         return list(found)
 
     def _list_roots(self, function: Function) -> Iterator[ast.expr]:
@@ -118,19 +118,21 @@ class Observed:
         return any(one is not None and other is not None for one, other in zip(sizes[:2], sizes[2:], strict=True))
 
 
-def find_world_vectors(series: Series) -> Iterator[SourceMistake]:
+def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
     """Yield the first vector of the world in an observation that has others in the frame of the robot, and does not
     show its heading, with which episodes begin in all directions."""
-    turns, directions, world = list(find_turns(series)), Directions(series), WorldVectors(series)
+    series, turns, directions, world = turned.series, turned.turns, turned.directions, turned.world
     observed = Observed(series, turns)
     if any(SEEN_WORDS & list_words(node) for node in observed.nodes):
         return
-    inside = [turn for turn in turns if turn.whole.node in set(observed.nodes)]
-    known = [(turn, directions.find(turn)) for turn in inside]
-    backwards = [(turn, found[1]) for turn, found in known if found is not None and found[0] < 0]
+    inside = [entry for entry in turned.known if entry[0].whole.node in set(observed.nodes)]
+    backwards = [(turn, found[1]) for turn, found in inside if found is not None and found[0] < 0]
+    orientations = {one.text for one in series.orientations}
     for turn, by in backwards:
         yaw = directions.read_yaw(by)
         is_of_world = world.is_gravity(turn.before) or observed.is_base_velocity(turn.part) or world.explain(turn)
+        if by in orientations and directions.has_engine and not world.has_free_base:
+            continue  # the gripper of an arm, whose joints tell its heading
         if yaw is None or not is_of_world or not _begins_anywhere(series, yaw):
             continue
         if any(_shows(series, node, yaw) for node in observed.nodes):

@@ -23,6 +23,7 @@ PLACE_WORDS = {
     *("xy", "xyz", "site", "point", "origin", "base", "ball", "box", "cube", "object", "puck", "gate", "dock"),
     *("station", "drone", "robot", "com", "center", "centre", "beacon", "door", "hand", "tip", "handle", "qpos", "fix"),
 }
+JOINT_WORDS = {"joint", "joints", "leg", "legs", "finger", "fingers", "wheel", "wheels", "motor", "motors", "dof"}
 OTHER_WORDS = {
     *("vel", "velocity", "speed", "cmd", "command", "commands", "omega", "rate", "qvel", "acc", "force", "torque"),
     *("wanted", "desired", "local", "body", "offset", "error", "err", "lin", "ang", "twist", "gain", "axis"),
@@ -40,6 +41,7 @@ WXYZ, XYZW = [1, 2, 3, 0], [0, 1, 2, 3]
 SAME = 1e-6
 FEWEST, NEARLY_ALL, MOSTLY, HARDLY_ANY = 10, 0.95, 0.7, 0.3
 MOST_CALLS = 60  # in which orientations are compared
+ALONG, ASIDE = 0.15, 0.4  # part of a motion that a velocity leaves over
 LEAST_SPREAD = 0.1  # of an angle [rad], standard deviation
 LEAST_TURN = 0.002  # of a vector's length, that a turn moves it
 
@@ -425,6 +427,12 @@ class WorldVectors:
         return bool(stays.mean() > MOSTLY and is_drawn)
 
     @functools.cached_property
+    def has_free_base(self) -> bool:
+        """Whether a robot of an engine can move freely, as far as the source shows it."""
+        texts = [ast.unparse(tree) for tree in self.series.source.trees.values()]
+        return self._has_free_joint or any("getBaseVelocity" in text for text in texts)
+
+    @functools.cached_property
     def _has_free_joint(self) -> bool:
         """Whether MuJoCo's first joint is a free one, as far as the source shows it."""
         texts = [ast.unparse(tree) for tree in self.series.source.trees.values()]
@@ -458,20 +466,24 @@ class WorldVectors:
             return True
         size, steps = turn.before.shape[2], np.diff(self.series.episodes) == 0
         for one, rows in self.series.vectors:
-            if (
-                rows.shape != turn.before.shape
-                or not list_words(one.node) & PLACE_WORDS
-                or isinstance(one.node, ast.BinOp)
-            ):
+            if rows.shape != turn.before.shape or not _is_place(one):
                 continue
             moved = np.diff(rows, axis=0)[steps].reshape(-1, size)
             old, new = (vectors[1:][steps].reshape(-1, size) for vectors in (turn.before, turn.after))
             known = np.isfinite(moved).all(axis=1) & np.isfinite(old).all(axis=1) & np.isfinite(new).all(axis=1)
             if known.sum() < 2 * FEWEST or not moved[known].any():
                 continue
-            if _measure_rest(moved[known], old[known]) < 0.05 and _measure_rest(moved[known], new[known]) > 0.3:
+            if _measure_rest(moved[known], old[known]) < ALONG and _measure_rest(moved[known], new[known]) > ASIDE:
                 return True
         return False
+
+
+def _is_place(one: Expression) -> bool:
+    """Say whether an expression is called a place, and not the angles of joints."""
+    words = list_words(one.node)
+    if isinstance(one.node, ast.BinOp) or words & JOINT_WORDS:
+        return False
+    return bool(words & (PLACE_WORDS - {"qpos"})) or bool(re.search(r"qpos\[0?:[23]\]", one.text.replace(" ", "")))
 
 
 def _measure_rest(moved: Array, velocity: Array) -> float:
@@ -490,11 +502,18 @@ def _is_parallel(one: Array, other: Array) -> bool:
     return bool((np.abs(units[0] - units[1]).max(axis=1) < SAME).mean() > NEARLY_ALL)
 
 
-def find_wrong_turns(series: Series) -> Iterator[SourceMistake]:
+class TurnedVectors:
+    """All turns of vectors in a source, with their directions."""
+
+    def __init__(self, series: Series) -> None:
+        self.series, self.directions, self.world = series, Directions(series), WorldVectors(series)
+        self.turns = list(find_turns(series))
+        self.known = [(turn, self.directions.find(turn)) for turn in self.turns]
+
+
+def find_wrong_turns(turned: TurnedVectors) -> Iterator[SourceMistake]:
     """Yield the turns of vectors of the world by the orientation itself, instead of its inverse."""
-    directions, world = Directions(series), WorldVectors(series)
-    turns = list(find_turns(series))
-    known = [(turn, directions.find(turn)) for turn in turns]
+    series, directions, world, known = turned.series, turned.directions, turned.world, turned.known
     explained = [(turn, found, world.explain(turn)) for turn, found in known if found is not None]
     rights = {found[1] for _, found, what in explained if found[0] < 0 and what is not None}
     rights |= {found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)}

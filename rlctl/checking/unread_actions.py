@@ -112,11 +112,11 @@ def _read_elements(index: ast.expr, size: int) -> list[int] | None:
         case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int(element))):
             return [size - element]
         case ast.Slice(lower=lower, upper=upper, step=None):
-            ends = [None if end is None else _read_elements(end, size) for end in (lower, upper)]
+            ends = [None if given is None else _read_elements(given, size) for given in (lower, upper)]
             if any(given is not None and found is None for given, found in zip((lower, upper), ends, strict=True)):
                 return None
-            first, last = ends[0][0] if ends[0] else 0, ends[1][0] if ends[1] else size
-            return list(range(first, last))
+            begin, end = ends[0][0] if ends[0] else 0, ends[1][0] if ends[1] else size
+            return list(range(begin, end))
     return None
 
 

@@ -1,4 +1,4 @@
-"""RL124, RL125, RL129, RL701, RL834 and RL835 by lines of the source: vectors turned, elements read, and ids compared."""
+"""RL124, RL125, RL129, RL701, RL834 and RL835 by lines: vectors that are turned, elements read, and ids compared."""
 
 import pytest
 
