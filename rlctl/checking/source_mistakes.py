@@ -1,7 +1,7 @@
 """Mistakes that the experiment `expressions` found in lines of the source, each for a rule."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from rlctl.checking.records import Records
@@ -9,6 +9,8 @@ from rlctl.checking.rule import Rule, RuleFinding
 
 MISTAKES = "mistakes of the source"
 """The fact with all of them."""
+FRAME_RULES = {"RL123", "RL124", "RL125", "RL127", "RL128", "RL129"}
+"""The rules that find vectors in wrong frames by what is observed and paid."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,9 +23,11 @@ class SourceMistake:
     where: tuple[str, int]
 
 
-def report_mistakes(records: Records, rule: Rule) -> Iterator[RuleFinding]:
-    """Yield the first mistake of a rule."""
+def report_mistakes(records: Records, rule: Rule, unless: Collection[str] = ()) -> Iterator[RuleFinding]:
+    """Yield the first mistake of a rule, unless an experiment has found the same for one of some other rules."""
     found: list[SourceMistake] = records.facts.get(MISTAKES, [])
+    if any(finding.rule in unless for finding in records.findings):
+        return
     for one in found:
         if one.rule == rule.id:
             yield RuleFinding(rule, one.message, dict(one.evidence), where=one.where)

@@ -10,7 +10,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.rotated import RotatedRobot, judges_rotated
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
-from rlctl.checking.source_mistakes import report_mistakes
+from rlctl.checking.source_mistakes import FRAME_RULES, report_mistakes
 from rlctl.checking.transitions import name_floats
 from rlctl.checking.turnings import Turning
 
@@ -42,14 +42,11 @@ TURN_ERROR = 0.1  # part of the length of a vector
 SAME_DIRECTION = 0.9  # length of the mean of unit vectors
 MATTERS = 0.25  # part of what rewards differ by in episodes that are not turned
 TINY = 1e-4  # of rewards
-SAME_MISTAKE = {"RL123", "RL127", "RL128"}
-"""The rules that find a vector of the world in other ways."""
 
 
 @judges_records(RULE, "expressions")
 def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    if not any(finding.rule in SAME_MISTAKE for finding in records.findings):
-        yield from report_mistakes(records, RULE)
+    yield from report_mistakes(records, RULE, FRAME_RULES)
 
 
 @judges_rotated(RULE)
