@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 
 from rlctl.checking.assignments import Assignments
 from rlctl.checking.expressions import Function
-from rlctl.checking.source_mistakes import SourceMistake
-from rlctl.checking.turned_expressions import Series, Turn, TurnedVectors, WorldVectors, list_words
+from rlctl.checking.source_mistakes import FRAME_RULES, SourceMistake
+from rlctl.checking.turned_expressions import VectorTurn
+from rlctl.checking.vector_series import VectorSeries, list_words
+from rlctl.checking.world_vectors import WorldVectors
+from rlctl.checking.wrong_turns import TurnedVectors
 
 Array = NDArray[np.float64]
 
@@ -38,10 +41,10 @@ SAME, MOSTLY = 1e-6, 0.9
 WIDE = 2.0  # range of the headings in which episodes begin [rad]
 
 
-class Observed:
+class ObservedCode:
     """The pieces of code of which an observation is made."""
 
-    def __init__(self, series: Series, turns: list[Turn]) -> None:
+    def __init__(self, series: VectorSeries, turns: list[VectorTurn]) -> None:
         self._series = series
         self._assignments = Assignments(series.source)
         self._turned = {turn.whole.node for turn in turns}
@@ -122,7 +125,7 @@ def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
     """Yield the first vector of the world in an observation that has others in the frame of the robot, and does not
     show its heading, with which episodes begin in all directions."""
     series, turns, directions, world = turned.series, turned.turns, turned.directions, turned.world
-    observed = Observed(series, turns)
+    observed = ObservedCode(series, turns)
     if any(SEEN_WORDS & list_words(node) for node in observed.nodes):
         return
     inside = [entry for entry in turned.known if entry[0].whole.node in set(observed.nodes)]
@@ -147,17 +150,17 @@ def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
                     f"{one.text}, {what}, is observed in the axes of the world, and {turn.whole.text} in the frame"
                 )
                 message += f" of the robot: nothing shows the heading, which is another one in each episode ({by})"
-                yield SourceMistake("RL129", message, {"element": one.text, "value": by}, one.where)
+                yield SourceMistake("RL129", message, {"element": one.text, "value": by}, one.where, FRAME_RULES)
                 return
 
 
-def _begins_anywhere(series: Series, yaw: Array) -> bool:
+def _begins_anywhere(series: VectorSeries, yaw: Array) -> bool:
     firsts = [yaw[series.episodes == number][:2] for number in np.unique(series.episodes)]
     known = np.array([rows[np.isfinite(rows)][0] for rows in firsts if np.isfinite(rows).any()])
     return len(known) > 2 and float(np.ptp(np.angle(np.exp(1j * known)))) > WIDE
 
 
-def _shows(series: Series, node: ast.expr, yaw: Array) -> bool:
+def _shows(series: VectorSeries, node: ast.expr, yaw: Array) -> bool:
     """Say whether a piece of code has the heading, its sine or its cosine, or an angle that changes as it does."""
     rows = series.read(node)
     if rows is None or len(rows) != len(yaw):
@@ -183,7 +186,9 @@ def _shows(series: Series, node: ast.expr, yaw: Array) -> bool:
     return bool(is_orientation)
 
 
-def _explain(series: Series, world: WorldVectors, node: ast.expr, yaw: Array, turns: list[Turn]) -> str | None:
+def _explain(
+    series: VectorSeries, world: WorldVectors, node: ast.expr, yaw: Array, turns: list[VectorTurn]
+) -> str | None:
     """Return what a vector of the world is; None for others."""
     for size in (2, 3):
         rows = series.read(node, size=size)
@@ -199,9 +204,9 @@ def _explain(series: Series, world: WorldVectors, node: ast.expr, yaw: Array, tu
             sides = [series.read(side, size=size) for side in (node.left, node.right)]
             if any(side is not None and _is_same(turn.after, side) for side in sides for turn in turns):
                 return None
-            found = world.find_way(Turn(one, node, one.text, rows, turned))
+            found = world.find_way(VectorTurn(one, node, one.text, rows, turned))
             return None if found is None else "a way"
-        if world.is_velocity(Turn(one, node, one.text, rows, turned)):
+        if world.is_velocity(VectorTurn(one, node, one.text, rows, turned)):
             return "the velocity that moves a position"
     return None
 

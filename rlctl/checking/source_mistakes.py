@@ -21,14 +21,13 @@ class SourceMistake:
     message: str
     evidence: Mapping[str, Any]
     where: tuple[str, int]
+    same: Collection[str] = ()  # the rules that find the same by what is observed and paid
 
 
-def report_mistakes(records: Records, rule: Rule, unless: Collection[str] = ()) -> Iterator[RuleFinding]:
-    """Yield the first mistake of a rule, unless an experiment has found the same for one of some other rules."""
+def report_mistakes(records: Records, rule: Rule) -> Iterator[RuleFinding]:
+    """Yield the first mistake of a rule that no experiment has found."""
     found: list[SourceMistake] = records.facts.get(MISTAKES, [])
-    if any(finding.rule in unless for finding in records.findings):
-        return
     for one in found:
-        if one.rule == rule.id:
+        if one.rule == rule.id and not any(finding.rule in one.same for finding in records.findings):
             yield RuleFinding(rule, one.message, dict(one.evidence), where=one.where)
             return

@@ -16,8 +16,9 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.source_mistakes import MISTAKES, SourceMistake
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
-from rlctl.checking.turned_expressions import Series, TurnedVectors, find_wrong_turns
 from rlctl.checking.unread_actions import find_unread_elements
+from rlctl.checking.vector_series import VectorSeries
+from rlctl.checking.wrong_turns import TurnedVectors, find_wrong_turns
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
@@ -72,7 +73,7 @@ def _find_mistakes(noted: NotedEpisodes, size: int) -> Iterator[SourceMistake]:
     """Yield the mistakes of lines, for the rules that other experiments judge, too; the action has `size` numbers."""
     source, numbers = noted.source, {number for call in noted.steps for number in call.values}
     evaluated = {source.expressions[number].function for number in numbers}
-    turned = TurnedVectors(Series(source, noted.episodes))
+    turned = TurnedVectors(VectorSeries(source, noted.episodes))
     yield from find_wrong_turns(turned)
     yield from find_world_vectors(turned)
     yield from find_wrong_ids(source, noted.episodes)

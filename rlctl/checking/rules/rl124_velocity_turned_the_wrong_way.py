@@ -17,7 +17,7 @@ from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import Turn, list_world_turns
-from rlctl.checking.source_mistakes import FRAME_RULES, report_mistakes
+from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
 RULE = Rule(
@@ -74,7 +74,7 @@ def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
     found = (
         list(find_wrong_turns(log)) if log is not None and not np.isfinite(log.physics_s) else []
     )  # an engine tells more
-    yield from found or report_mistakes(records, RULE, FRAME_RULES)
+    yield from found or report_mistakes(records, RULE)
 
 
 def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:

@@ -15,7 +15,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.checking.source_mistakes import FRAME_RULES, report_mistakes
+from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
 from rlctl.environments.info import find_mujoco
 
@@ -49,7 +49,7 @@ class _Frame(NamedTuple):
 
 @judges_records(RULE, "expressions")
 def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE, FRAME_RULES)
+    yield from report_mistakes(records, RULE)
 
 
 @judges_goals(RULE)

@@ -10,7 +10,7 @@ from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.rotated import RotatedRobot, judges_rotated
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
-from rlctl.checking.source_mistakes import FRAME_RULES, report_mistakes
+from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.transitions import name_floats
 from rlctl.checking.turnings import Turning
 
@@ -46,7 +46,7 @@ TINY = 1e-4  # of rewards
 
 @judges_records(RULE, "expressions")
 def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE, FRAME_RULES)
+    yield from report_mistakes(records, RULE)
 
 
 @judges_rotated(RULE)
