@@ -7,6 +7,7 @@ import itertools
 import re
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.expressions import Expression
 from rlctl.checking.term_names import split_name
@@ -155,6 +156,9 @@ class WorldVectors:
         if self._has_free_joint and re.search(FREE_VELOCITY, turn.text.replace(" ", "")):
             return True
         size, steps = turn.before.shape[2], np.diff(self.series.episodes) == 0
+        changes = np.abs(np.diff(turn.before, axis=0)[steps])
+        if not (changes[np.isfinite(changes)] > SAME).any():
+            return False  # a place that does not move, towards which the robot does
         for one, rows in self.series.vectors:
             if rows.shape != turn.before.shape or not _is_place(one):
                 continue
@@ -163,7 +167,13 @@ class WorldVectors:
             known = np.isfinite(moved).all(axis=1) & np.isfinite(old).all(axis=1) & np.isfinite(new).all(axis=1)
             if known.sum() < 2 * FEWEST or not moved[known].any():
                 continue
-            if _measure_rest(moved[known], old[known]) < ALONG and _measure_rest(moved[known], new[known]) > ASIDE:
+            episodes = np.repeat(self.series.episodes[1:][steps], rows.shape[1])[known]
+            changing = [_center(vectors[known], episodes) for vectors in (moved, old)]
+            if (
+                _measure_rest(moved[known], old[known]) < ALONG
+                and _measure_rest(*changing) < ASIDE
+                and _measure_rest(moved[known], new[known]) > ASIDE
+            ):
                 return True
         return False
 
@@ -174,6 +184,14 @@ def _is_place(one: Expression) -> bool:
     if isinstance(one.node, ast.BinOp) or words & JOINT_WORDS:
         return False
     return bool(words & (PLACE_WORDS - {"qpos"})) or bool(re.search(r"qpos\[0?:[23]\]", one.text.replace(" ", "")))
+
+
+def _center(vectors: Array, episodes: NDArray[np.int_]) -> Array:
+    """Return what vectors differ by from their mean in each episode."""
+    centered = vectors.copy()
+    for number in np.unique(episodes):
+        centered[episodes == number] -= vectors[episodes == number].mean(axis=0)
+    return centered
 
 
 def _measure_rest(moved: Array, velocity: Array) -> float:
