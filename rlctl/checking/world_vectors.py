@@ -181,7 +181,10 @@ class WorldVectors:
 def _is_place(one: Expression) -> bool:
     """Say whether an expression is called a place, and not the angles of joints."""
     words = list_words(one.node)
-    if isinstance(one.node, ast.BinOp) or words & JOINT_WORDS:
+    parameters = {argument.arg for argument in one.function.args.args} - {"self"}
+    if any(isinstance(node, ast.Name) and node.id in parameters for node in ast.walk(one.node)):
+        return False  # of a function that may be called with anything
+    if not isinstance(one.node, ast.Name | ast.Attribute | ast.Subscript) or words & JOINT_WORDS:
         return False
     return bool(words & (PLACE_WORDS - {"qpos"})) or bool(re.search(r"qpos\[0?:[23]\]", one.text.replace(" ", "")))
 
