@@ -5,7 +5,7 @@ import collections
 import dataclasses
 from collections.abc import Callable, Iterator
 
-from rlctl.checking.expressions import Function, Source
+from rlctl.checking.expressions import Function, SourceCode
 from rlctl.checking.term_names import split_name
 
 COPIES = {"array", "asarray", "copy", "float", "deepcopy", "astype", "float64", "float32", "squeeze", "item"}
@@ -27,7 +27,7 @@ class DataFlow:
     """Follows names and attributes of a source, without regard to which object has them. Classes of which `is_used` is
     not true are left out."""
 
-    def __init__(self, source: Source, is_used: Callable[[ast.ClassDef], bool]) -> None:
+    def __init__(self, source: SourceCode, is_used: Callable[[ast.ClassDef], bool]) -> None:
         self.source = source
         self.functions = collections.defaultdict[str, list[Function]](list)
         for named in source.functions.values():

@@ -4,7 +4,7 @@ import ast
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 
-from rlctl.checking.expressions import Function, NotedCall, Source
+from rlctl.checking.expressions import Function, NotedCall, SourceCode
 
 CONVERSIONS = {
     "array", "asarray", "astype", "atleast_1d", "copy", "flatten", "float", "float32", "float64", "item",
@@ -44,7 +44,7 @@ class Assigned:
 class Definitions:
     """Finds the expressions that define others."""
 
-    def __init__(self, source: Source, calls: Sequence[NotedCall]) -> None:
+    def __init__(self, source: SourceCode, calls: Sequence[NotedCall]) -> None:
         self.source = source
         self._first: dict[Function, int] = {}
         for call in [*calls[:3], *calls[-3:]]:

@@ -51,12 +51,14 @@ class Expression:
         return self.file, self.node.lineno
 
 
-class Source:
+class SourceCode:
     """The modules of an environment's author: those of its classes, and of the same folder what they have imported."""
 
     def __init__(self, env: Any) -> None:
         self.author = find_author(env)
         self.modules = _list_modules(env)
+        self.classes = [cls.__name__ for cls in list_own_classes(find_author(env))]
+        """The author's classes of the environment, the most derived first."""
         self.trees: dict[str, ast.Module] = {}
         for module in self.modules:
             with contextlib.suppress(OSError, SyntaxError, ValueError):
@@ -167,7 +169,7 @@ class ExpressionRecorder:
 
 
 @contextlib.contextmanager
-def record_expressions(source: Source) -> Iterator[ExpressionRecorder]:
+def record_expressions(source: SourceCode) -> Iterator[ExpressionRecorder]:
     """Replace the code of the author's functions by copies that note their expressions, as long as this lasts."""
     recorder = ExpressionRecorder()
     codes: dict[tuple[str, str, int], CodeType] = {}

@@ -7,8 +7,6 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 
-import numpy as np
-
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.definitions import CONVERSIONS, DEEPEST, Assigned, Definitions, ReadExpression
-from rlctl.checking.expressions import Function, NotedCall, Source
+from rlctl.checking.expressions import Function, NotedCall, SourceCode
 from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
@@ -38,7 +38,7 @@ class Summand:
 class RewardReader:
     """Reads the summands of the reward."""
 
-    def __init__(self, source: Source, calls: Sequence[NotedCall], weights: Mapping[str, float]) -> None:
+    def __init__(self, source: SourceCode, calls: Sequence[NotedCall], weights: Mapping[str, float]) -> None:
         self.source, self.calls = source, calls
         self.definitions = Definitions(source, calls)
         self.weights = weights  # of a task's terms

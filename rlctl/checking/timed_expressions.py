@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from rlctl.checking.experiments.attributes import AttributeLog
-from rlctl.checking.expressions import Expression, NotedCall, Source, Value
+from rlctl.checking.expressions import Expression, NotedCall, SourceCode, Value
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.step_times import SUBSTEP_WORDS, StepTimes, require_step_times
@@ -88,7 +88,7 @@ def find_majority(timed: Sequence[TimedExpression]) -> StepTimes | None:
     return StepTimes(control_s, control_s / substeps, f"{max(same)} lines of the source")
 
 
-def find_timed_expressions(source: Source, episodes: Sequence[Sequence[NotedCall]]) -> list[TimedExpression]:
+def find_timed_expressions(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) -> list[TimedExpression]:
     """Return where times are used that do not change."""
     steps = [call for episode in episodes for call in episode[1:]]
     constants = _find_constants(source, [call for episode in episodes for call in episode])
@@ -96,7 +96,7 @@ def find_timed_expressions(source: Source, episodes: Sequence[Sequence[NotedCall
     return [one for one in found if one.seconds <= LONGEST_S]
 
 
-def _find_constants(source: Source, calls: Sequence[NotedCall]) -> dict[ast.expr, float]:
+def _find_constants(source: SourceCode, calls: Sequence[NotedCall]) -> dict[ast.expr, float]:
     """Return the expressions that are always the same number."""
     seen: dict[int, float] = {}
     for call in calls:
@@ -108,7 +108,7 @@ def _find_constants(source: Source, calls: Sequence[NotedCall]) -> dict[ast.expr
 
 
 def _find_added(
-    source: Source, steps: Sequence[NotedCall], constants: Mapping[ast.expr, float]
+    source: SourceCode, steps: Sequence[NotedCall], constants: Mapping[ast.expr, float]
 ) -> Iterator[TimedExpression]:
     for one in source.expressions:
         statement = source.parents.get(one.node)
@@ -135,7 +135,7 @@ def _find_added(
                     yield TimedExpression(use, ast.unparse(target), one.text, times[0][1], most, one.where)
 
 
-def _read_sum(source: Source, node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
+def _read_sum(source: SourceCode, node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
     """Return what a sum adds to, and what it adds, where the statement assigns to the same name."""
     if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Add | ast.Sub):
         return None
@@ -225,7 +225,7 @@ def _words(node: ast.expr) -> set[str]:
     return set()
 
 
-def _count(source: Source, one: Expression, target: ast.expr, steps: Sequence[NotedCall]) -> int:
+def _count(source: SourceCode, one: Expression, target: ast.expr, steps: Sequence[NotedCall]) -> int:
     """Return how often an expression is evaluated in a step at most, for each entry that it is added to."""
     index = source.find(target.slice) if isinstance(target, ast.Subscript) else None
     most = 0
@@ -239,7 +239,7 @@ def _count(source: Source, one: Expression, target: ast.expr, steps: Sequence[No
 
 
 def _find_divided(
-    source: Source, steps: Sequence[NotedCall], constants: Mapping[ast.expr, float]
+    source: SourceCode, steps: Sequence[NotedCall], constants: Mapping[ast.expr, float]
 ) -> Iterator[TimedExpression]:
     for one in source.expressions:
         match one.node:
@@ -261,7 +261,7 @@ def _is_difference(node: ast.AST) -> bool:
     return isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
 
 
-def spans_steps(source: Source, difference: Expression, steps: Sequence[NotedCall]) -> bool:
+def spans_steps(source: SourceCode, difference: Expression, steps: Sequence[NotedCall]) -> bool:
     """Say whether a difference is that between a value and what it was in the step before."""
     assert isinstance(difference.node, ast.BinOp)
     parts = [source.find(node) for node in (difference.node.left, difference.node.right)]

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from rlctl.checking.expressions import Source, record_expressions
+from rlctl.checking.expressions import SourceCode, record_expressions
 from rlctl.checking.step_times import StepTimes
 from rlctl.checking.timed_expressions import Use, find_majority, find_timed_expressions
 
@@ -69,7 +69,7 @@ class Cart(Base):
 
 
 def play(env, steps=30):
-    source = Source(env)
+    source = SourceCode(env)
     calls = []
     with record_expressions(source) as recorder:
         with recorder.call(0) as noted:
@@ -91,7 +91,7 @@ def test_a_recorded_environment_does_the_same_and_its_code_is_put_back():
     plain, recorded = Cart(), Cart()
     code = Cart.step.__code__
     plain.reset(seed=0)
-    with record_expressions(Source(recorded)) as recorder:
+    with record_expressions(SourceCode(recorded)) as recorder:
         assert Cart.step.__code__ is not code
         recorded.reset(seed=0)
         with recorder.call(1) as noted:
@@ -114,7 +114,7 @@ def test_values_are_noted_by_expression_and_call():
 
 def test_a_value_can_be_forced():
     env = Cart()
-    source = Source(env)
+    source = SourceCode(env)
     number = next(one.number for one in source.expressions if one.text == "self.v > 0.5")
     with record_expressions(source) as recorder:
         env.reset(seed=0)
@@ -161,9 +161,9 @@ def test_wrong_times():
 
 
 def test_an_environment_of_a_library_has_no_source():
-    assert not Source(gymnasium.make("CartPole-v1")).expressions
+    assert not SourceCode(gymnasium.make("CartPole-v1")).expressions
 
 
 def test_a_module_that_is_not_a_file_is_left_out(monkeypatch):
     monkeypatch.setitem(sys.modules, "nowhere", SimpleNamespace(__file__=None))
-    assert {Path(file).name for file in Source(Cart()).trees} >= {"test_expressions.py"}
+    assert {Path(file).name for file in SourceCode(Cart()).trees} >= {"test_expressions.py"}

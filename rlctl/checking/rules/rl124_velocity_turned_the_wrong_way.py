@@ -17,6 +17,7 @@ from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import Turn, list_world_turns
+from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
 RULE = Rule(
@@ -25,12 +26,14 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Three elements of the observation are the velocity of a free body, turned by its orientation in the wrong
-        direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both
-        velocities of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its
-        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction
-        that reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an
-        engine is read from its attributes: its velocity is what changes its position, its frame the one in which its
-        actions push it, or the orientation that its angular velocity turns.
+        direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both velocities
+        of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its angular
+        velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction that
+        reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an engine is
+        read from its attributes: its velocity is what changes its position, its frame the one in which its actions
+        push it, or the orientation that its angular velocity turns. Or a line of the source does so: it turns a
+        vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse, with a
+        way in the world.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
@@ -65,12 +68,13 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         yield from found or _find_directions(one.observed, one.episodes, list_world_turns(one))
 
 
-@judges_records(RULE, "worlds", "attributes")
+@judges_records(RULE, "worlds", "attributes", "expressions")
 def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
-    yield from find_wrong_turns(log)
+    found = (
+        list(find_wrong_turns(log)) if log is not None and not np.isfinite(log.physics_s) else []
+    )  # an engine tells more
+    yield from found or report_mistakes(records, RULE)
 
 
 def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:

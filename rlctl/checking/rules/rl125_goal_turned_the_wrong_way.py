@@ -8,12 +8,14 @@ import numpy as np
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_world
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
-from rlctl.checking.records import FIRST_SEED, ChildMessage
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
 from rlctl.environments.info import find_mujoco
 
@@ -23,8 +25,9 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The observation has the way to a goal, turned by the orientation of a body, or by its yaw, in the wrong
-        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how
-        it is turned. A policy that does not see the heading too cannot learn where the goal is.
+        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how it
+        is turned, or a line of the source turns the way by the orientation itself. A policy that does not see the
+        heading too cannot learn where the goal is.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v); by a yaw
@@ -42,6 +45,11 @@ class _Frame(NamedTuple):
     name: str
     client: int
     link: Link
+
+
+@judges_records(RULE, "expressions")
+def _judge_source(records: Records) -> Iterator[RuleFinding]:
+    yield from report_mistakes(records, RULE)
 
 
 @judges_goals(RULE)

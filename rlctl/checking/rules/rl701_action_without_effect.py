@@ -5,21 +5,23 @@ from typing import Literal, get_args
 
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED, Records
 from rlctl.checking.rule import OutOfTime, Rule, RuleFinding, Severity, list_names
+from rlctl.checking.source_mistakes import report_mistakes
 
 RULE = Rule(
     "RL701",
     "action without effect",
     Severity.WARNING,
     meaning="""
-        An element of the action was set to its lowest and to its highest value, and the episode stayed the same
-        to the last bit. Noise on such an element only costs exploration. An element that only changes the
-        reward of its own step (a cost) or its own copy in the observation moves nothing either. An error if no
-        element does anything else: there is nothing to learn. An info if the reward of the own step can also
-        rise, as in a bandit, or if all values in one half of the range do the same; a warning where that is so for
-        every element.
+        An element of the action was set to its lowest and to its highest value, and the episode stayed the same to
+        the last bit. Noise on such an element only costs exploration. An element that only changes the reward of its
+        own step (a cost) or its own copy in the observation moves nothing either. Or the source reads one element in
+        two statements and never the one beside it. An error if no element does anything else: there is nothing to
+        learn. An info if the reward of the own step can also rise, as in a bandit, or if all values in one half of
+        the range do the same; a warning where that is so for every element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
@@ -37,6 +39,11 @@ LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penaltie
 Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 """Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
 in the observation; or nothing."""
+
+
+@judges_records(RULE, "expressions")
+def _judge_source(records: Records) -> Iterator[RuleFinding]:
+    yield from report_mistakes(records, RULE)
 
 
 @judges_actions(RULE)

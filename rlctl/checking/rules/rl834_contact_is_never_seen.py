@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.feet import BASE, find_feet, list_touched, read_touches
 from rlctl.checking.mujoco_worlds import MujocoStateReader, library
-from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_others
 from rlctl.checking.shared_frames import name_observed
+from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.term_names import is_paid, split_name
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array
@@ -22,10 +24,11 @@ RULE = Rule(
     "contact is never seen",
     Severity.WARNING,
     meaning="""
-        The robot stands on its feet or wheels, and what says so is 0 in every step: a touch sensor of MuJoCo whose site
-        does not contain the points of contact, which counts only forces inside its site; or numbers of the observation,
-        or a reward term, that are called after the contact of feet. Or such a number is always 1, also while nothing
-        touches. What is rewarded, observed or ended by contacts never changes.
+        The robot stands on its feet or wheels, and what says so is 0 in every step: a touch sensor of MuJoCo whose
+        site does not contain the points of contact, which counts only forces inside its site; or numbers of the
+        observation, or a reward term, that are called after the contact of feet. Or such a number is always 1, also
+        while nothing touches. Or a line compares the geoms of a contact with ids of joints, or its distance with a
+        force. What is rewarded, observed or ended by contacts never changes.
     """,
     fix="""
         Make the site of a touch sensor larger than the geom that touches, and place it around the contact. Compare the
@@ -42,6 +45,11 @@ CONTACT_WORDS = {"contact", "contacts", "grounded", "touch", "touches", "touchin
 FEET = {"feet", "foot", "ground", "wheel", "wheels"}
 MEANT_WORDS = {"on", "in", "flag", "flags", "force", "forces", "sensor", "sensors", "state", "left", "right", "all"}
 """What may stand beside the words above without saying that something else is touched."""
+
+
+@judges_records(RULE, "expressions")
+def _judge_source(records: Records) -> Iterator[RuleFinding]:
+    yield from report_mistakes(records, RULE)
 
 
 @judges_trials(RULE, place=31)

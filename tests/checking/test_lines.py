@@ -1,0 +1,48 @@
+"""RL124, RL125, RL129, RL701, RL834 and RL835 by lines: vectors that are turned, elements read, and ids compared."""
+
+import pytest
+
+from rlctl.checking.source_mistakes import MISTAKES
+from tests.checking.judging import findings, records_of
+
+TURNED = ["RL124KiteDown", "RL124KiteNorth", "RL125KiteWay", "RL124KiteLens", "RL125BargeWay", "RL701BargeCopied"]
+TURNED += ["RL129SkiffWayInTheWorld"]
+COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLeftTwice", "RL835BipedTwoOfTheRight"]
+
+
+def find_mistakes(task):
+    """The rules of the mistakes that the source alone shows."""
+    return {mistake.rule for mistake in records_of(task, "build", "expressions").facts[MISTAKES]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TURNED)
+def test_a_line_turns_a_vector_the_wrong_way_or_leaves_out_an_element_of_the_action(name):
+    assert find_mistakes(f"broken_lines.py:{name}") == {name[:5]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMPARED)
+def test_a_line_compares_or_looks_up_the_wrong_ids(name):
+    pytest.importorskip("mujoco")
+    assert find_mistakes(f"broken_ids.py:{name}") == {name[:5]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["broken_lines.py:Kite", "broken_lines.py:Barge", "broken_lines.py:Skiff"])
+def test_their_twins_are_right(task):
+    assert find_mistakes(task) == set()
+
+
+@pytest.mark.slow
+def test_the_twin_that_compares_geoms_is_right():
+    pytest.importorskip("mujoco")
+    assert find_mistakes("broken_ids.py:Biped") == set()
+
+
+@pytest.mark.slow
+def test_a_finding_names_the_line():
+    (finding,) = findings("broken_lines.py:RL124KiteLens", "RL124")
+    assert "matrix.T @ LENS" in finding.message
+    assert finding.where is not None
+    assert finding.where[0].endswith("broken_lines.py")
