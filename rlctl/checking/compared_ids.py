@@ -2,11 +2,11 @@
 
 import ast
 import collections
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from rlctl.checking.assignments import Assignments
-from rlctl.checking.expressions import Function, NotedCall, SourceCode
-from rlctl.checking.source_mistakes import SourceMistake
+from rlctl.checking.expressions import NotedCall, SourceCode
+from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.term_names import split_name
 
 KINDS = {"geom": "geom", "body": "body", "joint": "joint", "jnt": "joint", "site": "site", "actuator": "actuator"}
@@ -82,7 +82,7 @@ class Ids:
         return bool({"contact", "contacts", "con", "c"} & set(split_name(ast.unparse(node).rsplit(".", 1)[-1])))
 
 
-def find_wrong_ids(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) -> Iterator[SourceMistake]:
+def find_wrong_ids(rule: Rule, source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) -> Iterator[RuleFinding]:
     """Yield comparisons of the ids of contacts with those of another kind, and of a distance that is never so large."""
     ids = Ids(Assignments(source))
     for one in source.expressions:
@@ -101,7 +101,7 @@ def find_wrong_ids(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) 
                         f"{one.text} compares the id of a contact's {min(theirs)} with {ast.unparse(other)}, which is"
                     )
                     message += f" that of a {wrong[0]}: ids of different kinds have nothing to do with each other"
-                    yield SourceMistake("RL834", message, {"element": one.text, "value": wrong}, one.where)
+                    yield RuleFinding(rule, message, {"element": one.text, "value": wrong}, where=one.where)
         match left, one.node.ops[0]:
             case ast.Subscript(value=owner, slice=ast.Constant(value=8)), ast.Gt() | ast.GtE() if ids.is_point(owner):
                 if len(values) >= FEWEST and not any(values):
@@ -109,18 +109,18 @@ def find_wrong_ids(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) 
                     message += (
                         " contact point is the distance, and below 0 where bodies touch; the normal force is field 9"
                     )
-                    yield SourceMistake("RL834", message, {"element": one.text, "value": len(values)}, one.where)
+                    yield RuleFinding(rule, message, {"element": one.text, "value": len(values)}, where=one.where)
 
 
 def _open_literal(node: ast.expr) -> list[ast.expr]:
     return node.elts if isinstance(node, ast.Set | ast.Tuple | ast.List) else [node]
 
 
-def find_doubled_ids(source: SourceCode, evaluated: set[Function]) -> Iterator[SourceMistake]:
+def find_doubled_ids(rule: Rule, source: SourceCode, evaluated: Collection[ast.AST]) -> Iterator[RuleFinding]:
     """Yield lists in which one part is looked up twice by its name, in classes whose functions were evaluated."""
     for file, tree in source.trees.items():
         classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-        own = [one for one in classes if one.name in source.classes or evaluated & set(one.body)]
+        own = [one for one in classes if one.name in source.classes or any(node in evaluated for node in one.body)]
         for node in (node for one in own for node in ast.walk(one)):
             if not isinstance(node, ast.List | ast.Tuple) or len(node.elts) < 2:
                 continue
@@ -128,7 +128,7 @@ def find_doubled_ids(source: SourceCode, evaluated: set[Function]) -> Iterator[S
             doubled = [text for text, count in collections.Counter(texts).items() if count > 1]
             if doubled and len(texts) == len(node.elts):
                 message = f"{ast.unparse(node)} looks up {doubled[0]} twice: another part of the list is left out"
-                yield SourceMistake("RL835", message, {"element": doubled[0]}, (file, node.lineno))
+                yield RuleFinding(rule, message, {"element": doubled[0]}, where=(file, node.lineno))
 
 
 def _is_lookup(node: ast.expr) -> bool:

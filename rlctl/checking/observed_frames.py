@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from rlctl.checking.assignments import Assignments
 from rlctl.checking.expressions import Function
-from rlctl.checking.source_mistakes import FRAME_RULES, SourceMistake
+from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turned_expressions import VectorTurn
 from rlctl.checking.vector_series import VectorSeries, list_words
 from rlctl.checking.world_vectors import WorldVectors
-from rlctl.checking.wrong_turns import TurnedVectors
+from rlctl.checking.wrong_turns import FRAME_RULES, TurnedVectors
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ class ObservedCode:
         return any(one is not None and other is not None for one, other in zip(sizes[:2], sizes[2:], strict=True))
 
 
-def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
+def find_world_vectors(rule: Rule, turned: TurnedVectors) -> Iterator[RuleFinding]:
     """Yield the first vector of the world in an observation that has others in the frame of the robot, and does not
     show its heading, with which episodes begin in all directions."""
     series, turns, directions, world = turned.series, turned.turns, turned.directions, turned.world
@@ -150,7 +150,8 @@ def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
                     f"{one.text}, {what}, is observed in the axes of the world, and {turn.whole.text} in the frame"
                 )
                 message += f" of the robot: nothing shows the heading, which is another one in each episode ({by})"
-                yield SourceMistake("RL129", message, {"element": one.text, "value": by}, one.where, FRAME_RULES)
+                evidence = {"element": one.text, "value": by}
+                yield RuleFinding(rule, message, evidence, where=one.where, same=FRAME_RULES)
                 return
 
 

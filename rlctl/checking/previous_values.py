@@ -2,7 +2,6 @@
 
 import ast
 import dataclasses
-import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -91,7 +90,7 @@ class KeptDifferences:
         """Say whether a step replaces what is kept by a copy of the new value."""
         for assignment in self.flow.assigned[one.key]:
             origin, _ = self.flow.resolve(assignment.value, assignment.function)
-            if assignment.function in self.of_steps and ast.unparse(origin) == ast.unparse(one.origin):
+            if assignment.function in self.noted.of_steps and ast.unparse(origin) == ast.unparse(one.origin):
                 return True
         return False
 
@@ -114,7 +113,7 @@ class KeptDifferences:
     def _may_be_replaced(self, one: KeptDifference) -> bool:
         """Say whether code of a step replaces what is kept, other than where a new goal comes."""
         return any(
-            assignment.function in self.of_steps and not self.comes_with_goal(assignment)
+            assignment.function in self.noted.of_steps and not self.comes_with_goal(assignment)
             for assignment in self.flow.assigned[one.key]
         )
 
@@ -128,12 +127,6 @@ class KeptDifferences:
             side = branch.body if is_met else branch.orelse
             blocks.append(side if isinstance(side, list) else [side])
         return any(is_goal(key) for block in blocks for node in block for key in self.flow.list_sets(node))
-
-    @functools.cached_property
-    def of_steps(self) -> set[ast.AST]:
-        """The functions that steps run."""
-        expressions = self.noted.source.expressions
-        return {expressions[number].function for call in self.noted.steps for number in call.values}
 
     def is_paid(self, one: KeptDifference) -> bool:
         """Say whether another difference in one step changes the reward of this step."""

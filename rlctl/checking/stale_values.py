@@ -45,7 +45,7 @@ class StaleValues:
             goals = {self._read_copied(one) for one in assignments}
             goal = goals.pop() if len(goals) == 1 else ""
             is_meant = {*read_words(key)} & FIRST_WORDS or is_previous_key(key) or key[-1].isdigit()
-            is_set = any(one.function in self.kept.of_steps for one in assignments)
+            is_set = any(one.function in self.noted.of_steps for one in assignments)
             if not goal or goal == key or is_meant or is_set:
                 continue
             for one in self.flow.assigned.get(goal, ()):
@@ -88,7 +88,7 @@ class StaleValues:
             words = {*read_words(key)}
             if not words & LASTING_WORDS or words & SUM_WORDS or not self._is_required(key):
                 continue
-            of_steps = [one for one in assignments if one.function in self.kept.of_steps]
+            of_steps = [one for one in assignments if one.function in self.noted.of_steps]
             counting = [one for one in of_steps if self._counts_under_condition(one, key)]
             others = [one for one in of_steps if one not in counting and not self.kept.comes_with_goal(one)]
             if len(counting) == 1 and not others:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rlctl.checking.source_mistakes import MISTAKES
+from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from tests.checking.judging import findings, records_of
 
 TURNED = ["RL124KiteDown", "RL124KiteNorth", "RL125KiteWay", "RL124KiteLens", "RL125BargeWay", "RL701BargeCopied"]
@@ -12,7 +12,7 @@ COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLef
 
 def find_mistakes(task):
     """The rules of the mistakes that the source alone shows."""
-    return {mistake.rule for mistake in records_of(task, "build", "expressions").facts[MISTAKES]}
+    return {finding.rule for finding in records_of(task, "build", "expressions").facts[BY_EXPRESSIONS]}
 
 
 @pytest.mark.slow
