@@ -5,14 +5,14 @@ import collections
 import dataclasses
 from collections.abc import Collection, Iterator
 
+from rlctl.checking.assignments import CONVERSIONS
 from rlctl.checking.expressions import Function, SourceCode
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.term_names import split_name
 
 ACTORS = {"step", "act", "apply_action", "step_async", "_apply_action", "apply_actions", "_act"}
 COSTS = {"sum", "square", "norm", "mean", "abs", "squared", "linalg", "dot", "vdot", "max", "isfinite", "all", "any"}
-SAME_SHAPE = {"clip", "asarray", "array", "copy", "astype", "float", "float64", "float32", "nan_to_num", "reshape"}
-SAME_SHAPE |= {"atleast_2d", "ravel", "flatten", "tanh"}
+SAME_SHAPE = CONVERSIONS | {"atleast_2d", "clip", "reshape", "tanh"}
 OLD_WORDS = {"last", "prev", "previous", "old", "change", "delta", "history", "before", "diff", "cost", "penalty"}
 
 

@@ -8,6 +8,7 @@ import functools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.expressions import ExpressionRecorder, NotedCall, SourceCode, record_expressions
@@ -17,7 +18,6 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, RuleFinding
 from rlctl.checking.summands import RewardReader
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
-from rlctl.checking.values import find_author, list_own_classes
 from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.wrong_turns import TurnedVectors
 
@@ -61,18 +61,10 @@ class NotedEpisodes:
             self._times.append(read_clock() - began)
         return played
 
-    def is_used(self, cls: ast.ClassDef) -> bool:
-        """Say whether a class is one of the environment, or does something in its episodes."""
-        return cls.name in self._own_names or any(node in self._evaluated for node in cls.body)
-
     @functools.cached_property
-    def _own_names(self) -> set[str]:
-        return {own.__name__ for own in list_own_classes(find_author(self.context.instance.env))}
-
-    @functools.cached_property
-    def _evaluated(self) -> set[ast.AST]:
-        calls = [call for episode in self.episodes for call in episode]
-        return {self.source.expressions[number].function for call in calls for number in call.values}
+    def definitions(self) -> Definitions:
+        """What defines the expressions."""
+        return Definitions(self.source, self.episodes)
 
     @functools.cached_property
     def of_steps(self) -> Collection[ast.AST]:
@@ -94,7 +86,7 @@ class NotedEpisodes:
         """What is added up to the reward."""
         author = self.source.author
         weights = {} if hasattr(author, "step") else getattr(author, "reward_weights", {})  # of a task
-        return RewardReader(self.source, self.steps, weights)
+        return RewardReader(self.definitions, self.steps, weights)
 
 
 BY_EXPRESSIONS = "findings by expressions"

@@ -50,7 +50,7 @@ MEANT_WORDS = {"on", "in", "flag", "flags", "force", "forces", "sensor", "sensor
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    yield from itertools.islice(find_wrong_ids(RULE, noted.source, noted.episodes), 1)
+    yield from itertools.islice(find_wrong_ids(RULE, noted.definitions, noted.episodes), 1)
 
 
 @judges_trials(RULE, place=31)
