@@ -34,12 +34,19 @@ class Assignment:
         match self.statement:
             case ast.AugAssign(op=ast.Add() | ast.Sub() as operator):
                 return [(self.value, _read_sign(operator))]
+        if self.is_part or self.element is not None:
+            return []
         text, node = ast.unparse(self.target), self.value
         parts: list[tuple[ast.expr, float]] = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
             parts.insert(0, (node.right, _read_sign(node.op)))
             node = node.left
         return parts if parts and ast.unparse(node) == text else []
+
+    @property
+    def parts(self) -> Sequence[tuple[ast.expr, float]]:
+        """What is added to the target, or what it is set to, with signs."""
+        return self.added or [(self.value, 1.0)]
 
     @property
     def is_known(self) -> bool:

@@ -6,11 +6,20 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
 
-from rlctl.checking.assignments import LIBRARIES, Assignment, list_assignments, read_converted, read_key, read_root
+from rlctl.checking.assignments import (
+    LIBRARIES,
+    Assignment,
+    list_assignments,
+    read_converted,
+    read_key,
+    read_name,
+    read_root,
+)
 from rlctl.checking.expressions import Function, NotedCall, SourceCode, walk_own
 
 DEEPEST = 12  # names and calls that are followed
 MOST_DEEP = 4  # the same, to all that a value may be computed from
+MOST_WALKED = 600  # expressions
 BEGINNINGS = {"__init__", "reset", "reset_model", "__post_init__"}
 
 
@@ -58,9 +67,8 @@ class Definitions:
                 if key := read_key(assignment.target):
                     self.assigned[key].append(assignment)
             for node in walk_own(function):
-                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
-                    name = node.func.id if isinstance(node.func, ast.Name) else node.func.attr
-                    self.calls[name].append((node, function))
+                if isinstance(node, ast.Call):
+                    self.calls[read_name(node.func)].append((node, function))
 
     def _name_class(self, node: ast.AST) -> str:
         """Return the innermost class around a node; empty if there is none."""
@@ -121,19 +129,13 @@ class Definitions:
 
     def list_returned(self, place: ReadExpression) -> list[ReadExpression]:
         """Return what the own function that is called returns."""
-        match place.node:
-            case ast.Call(func=ast.Name(id=name)):
-                function = self.find_function(name)
-            case ast.Call(func=ast.Attribute(value=ast.Name() | ast.Attribute() as owner, attr=name)) if (
-                read_root(owner) not in LIBRARIES
-            ):
-                function = self.find_function(name)
-            case _:
-                return []
-        if function is None or place.depth > DEEPEST:
+        call = place.node
+        if not isinstance(call, ast.Call) or read_root(call.func) in {"", *LIBRARIES} or place.depth > DEEPEST:
             return []
-        assert isinstance(place.node, ast.Call)
-        arguments = {key: place.at(value) for key, value in _bind(place.node, function).items()}
+        function = self.find_function(read_name(call.func))
+        if function is None:
+            return []
+        arguments = {key: place.at(value) for key, value in _bind(call, function).items()}
         return _list_returned(function, arguments, place.depth)
 
     def _list_given(self, place: ReadExpression, name: str) -> list[ReadExpression]:
@@ -188,10 +190,10 @@ class Definitions:
             place = found[0]
         return place.node
 
-    def walk(self, place: ReadExpression, most: int = 60) -> Iterator[ReadExpression]:
+    def walk(self, place: ReadExpression) -> Iterator[ReadExpression]:
         """Yield an expression, its parts, and those of what they stand for."""
         waiting, seen = [place], set[ast.AST]()
-        while waiting and len(seen) < most * 10:
+        while waiting and len(seen) < MOST_WALKED:
             one = waiting.pop()
             if one.node in seen:
                 continue
@@ -219,13 +221,11 @@ class Definitions:
 
     def read_parts(self, name: ast.Name) -> list[ast.expr]:
         """Return what is unpacked into a name among others, and what is assigned to its elements."""
-        found = []
-        for one in self._assignments[self.source.find_function(name)]:
-            is_element = isinstance(one.target, ast.Subscript)
-            target = one.target.value if isinstance(one.target, ast.Subscript) else one.target
-            if isinstance(target, ast.Name) and target.id == name.id and (is_element or one.element is not None):
-                found.append(one.value)
-        return found
+        several = self._assignments[self.source.find_function(name)]
+        found = [one for one in several if one.element is not None and ast.unparse(one.target) == name.id]
+        elements = [one for one in several if isinstance(one.target, ast.Subscript)]
+        found += [one for one in elements if ast.unparse(one.target.value) == name.id]  # type: ignore[attr-defined]
+        return [one.value for one in found]
 
     def read_returned(self, call: ast.Call) -> list[ast.expr]:
         """Return what the own function that is called returns."""

@@ -73,12 +73,12 @@ def _read_time(node: ast.expr) -> ast.expr | None:
 
 def _is_timer(definitions: Definitions, key: str) -> bool:
     """Say whether an attribute is counted up, and is set to 0 other than in the functions that begin an episode."""
-    counts = [one for one in definitions.assigned[key] if _counts_up(definitions, key, one.statement)]
+    counts = [one for one in definitions.assigned[key] if _counts_up(key, one.statement)]
     zeroes = [one for one in definitions.assigned[key] if _sets_back(one.statement, one.value)]
     return bool(counts and zeroes)
 
 
-def _counts_up(definitions: Definitions, key: str, statement: ast.stmt) -> bool:
+def _counts_up(key: str, statement: ast.stmt) -> bool:
     if isinstance(statement, ast.AugAssign):
         return isinstance(statement.op, ast.Add)
     sums = [node for node in ast.walk(statement) if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add)]

@@ -149,7 +149,7 @@ class RewardReader:
                 yield Summand(own or ast.unparse(place.node), place, weight, conditions, replaces)
         for order, assigned in enumerate(before):
             tests = (*conditions, *self.definitions.list_conditions(assigned.statement))
-            for value, sign in assigned.added or [(assigned.value, 1.0)]:
+            for value, sign in assigned.parts:
                 deeper = dataclasses.replace(place, node=value, depth=place.depth + 1)
                 looped = self._expand_loop(deeper, assigned, sign * weight, tests) if assigned.added else None
                 if looped is not None:
@@ -280,7 +280,7 @@ class RewardReader:
                     case ast.Subscript(value=owner, slice=ast.Constant(value=key)) if (
                         ast.unparse(owner) == text and one.is_known and one.statement.lineno < place.node.lineno
                     ):
-                        for value, _ in one.added or [(one.value, 1.0)]:
+                        for value, _ in one.parts:
                             tests = tuple(self.definitions.list_conditions(one.statement))
                             yield str(key), place.at(value), tests
 
