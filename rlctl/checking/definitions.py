@@ -45,7 +45,10 @@ class Definitions:
         self.source = source
         functions = [function for named in source.functions.values() for function in named]
         self._assignments = {function: list_assignments(function) for function in functions}
-        self._classes = {function: self._name_class(function) for function in functions}
+        classes = [node for tree in source.trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+        self._classes = dict.fromkeys(functions, "") | {
+            one: owner.name for owner in classes for one in ast.walk(owner) if isinstance(one, Function)
+        }  # the innermost one of each function
         steps = [call for episode in episodes for call in episode[1:]]
         self._first: dict[Function, int] = {}
         for call in [*steps[:3], *steps[-3:]]:
@@ -70,21 +73,13 @@ class Definitions:
                 if isinstance(node, ast.Call):
                     self.calls[read_name(node.func)].append((node, function))
 
-    def _name_class(self, node: ast.AST) -> str:
-        """Return the innermost class around a node; empty if there is none."""
-        while node in self.source.parents:
-            node = self.source.parents[node]
-            if isinstance(node, ast.ClassDef):
-                return node.name
-        return ""
-
     def find_function(self, name: str) -> Function | None:
         """Return the function of a name that is called first, or the only one, or that of the most derived class of the
         environment; None if there is none."""
         named = self.functions.get(name, [])
-        called = sorted((one for one in named if one in self._first), key=lambda one: self._first[one])
+        called = [one for one in named if one in self._first]
         if called or len(named) == 1:
-            return [*called, *named][0]
+            return min(called, key=lambda one: self._first[one], default=named[0])
         owners = {self._classes[one]: one for one in named}
         return next((owners[name] for name in self.source.classes if name in owners), None)
 
@@ -96,14 +91,14 @@ class Definitions:
             found[ast.unparse(one.target)].append(one)
         return dict(found)
 
+    def _list_known(self, function: Function, text: str) -> list[Assignment]:
+        return [one for one in self.list_assigned(function).get(text, ()) if one.is_known]
+
     def list_before(self, place: ReadExpression) -> list[Assignment]:
         """Return what was assigned to a name or attribute before this place, from the last time on that it was
         replaced in any case."""
-        several = [
-            one
-            for one in self.list_assigned(place.function).get(ast.unparse(place.node), ())
-            if one.is_known and (one.statement.end_lineno or 0) < place.node.lineno
-        ]
+        several = self._list_known(place.function, ast.unparse(place.node))
+        several = [one for one in several if (one.statement.end_lineno or 0) < place.node.lineno]
         for index in range(len(several) - 1, -1, -1):
             one = several[index]
             if not one.added and self.source.parents.get(one.statement) is place.function:
@@ -155,7 +150,7 @@ class Definitions:
         found: list[ReadExpression] = []
         for function in self.called:
             if function is not place.function:
-                several = [one for one in self.list_assigned(function).get(text, ()) if one.is_known]
+                several = self._list_known(function, text)
                 if any(one.added for one in several):
                     return []
                 found += self._select_all(ReadExpression(place.node, function, {}, place.depth), several)
@@ -191,7 +186,7 @@ class Definitions:
         return place.node
 
     def walk(self, place: ReadExpression) -> Iterator[ReadExpression]:
-        """Yield an expression, its parts, and those of what they stand for."""
+        """Yield an expression, its parts, and those of what they stand for; of what a loop goes through, too."""
         waiting, seen = [place], set[ast.AST]()
         while waiting and len(seen) < MOST_WALKED:
             one = waiting.pop()
@@ -199,13 +194,9 @@ class Definitions:
                 continue
             seen.add(one.node)
             yield one
-            waiting += self.follow(one) or self._list_iterated(one)
+            loops = self.list_assigned(one.function).get(ast.unparse(one.node), ())
+            waiting += self.follow(one) or [one.at(loop.value) for loop in loops if loop.is_part]
             waiting += [one.at(part) for part in _list_parts(one.node)]
-
-    def _list_iterated(self, place: ReadExpression) -> list[ReadExpression]:
-        """Return through what a loop goes whose variable a name is."""
-        several = self.list_assigned(place.function).get(ast.unparse(place.node), ())
-        return [place.at(one.value) for one in several if one.is_part]
 
     def read(self, node: ast.expr) -> list[ast.expr]:
         """Return all that a name is set to in its function, or an attribute in its class, at any time; also through
@@ -248,8 +239,8 @@ class Definitions:
     def _list_origins(self, node: ast.AST, function: Function) -> Iterator[tuple[ast.AST, Function]]:
         match node:
             case ast.Name(id=name):
-                several = self.list_assigned(function).get(name, ())
-                yield from ((one.value, function) for one in several if one.element is None and one.is_known)
+                several = self._list_known(function, name)
+                yield from ((one.value, function) for one in several if one.element is None)
                 yield from ((one.node, one.function) for one in self._list_given(ReadExpression(node, function), name))
             case ast.Attribute(attr=name) | ast.Call(func=ast.Name(id=name)):
                 yield from ((inner, inner) for inner in self.functions.get(name, ()))
