@@ -1,4 +1,5 @@
-"""What is paid in the step after the source has gone on to a new goal, whose branch is forced to be taken."""
+"""What is paid in the step in which the source goes on to a new goal, whose branch is forced to be taken, and in the
+next one."""
 
 import ast
 import dataclasses
@@ -29,6 +30,7 @@ class GoalJump:
     difference: KeptDifference
     key: str  # of the goal
     test: str  # the condition under which it changes
+    at_once: bool  # in the step in which the goal changes, not in the next one
     jump: float
     usual: float
     episodes: int
@@ -49,7 +51,7 @@ class GoalDraws:
         self.kept, self.definitions, self.noted = kept, kept.definitions, kept.noted
 
     def find_jumps(self) -> Iterator[GoalJump]:
-        """Yield differences that jump in the step after a new goal, and are paid."""
+        """Yield differences that jump with a new goal, and are paid."""
         for one in self.kept.differences:
             is_kept = is_previous_key(one.key) or (
                 isinstance(one.whole.node, ast.BinOp) and spans_steps(self.noted.source, one.whole, self.noted.steps)
@@ -65,9 +67,9 @@ class GoalDraws:
         keys = sorted(self.definitions.list_reads(one.new.node, one.whole.function) & self.definitions.assigned.keys())
         goals = [(key, assignment) for key in keys for assignment in self.definitions.assigned[key]]
         goals = [(key, assignment) for key, assignment in goals if self.is_new_goal(key, assignment)]
-        if any(self._adds_up(one, key) for key in {key for key, _ in goals}):
-            return []
         branches = [Branch(key, tests) for key, assignment in goals for tests in self.list_tests(assignment)]
+        if any(self._adds_up(one, key) for key in {branch.key for branch in branches}):
+            return []
         return list(dict.fromkeys(branches))[:MOST_BRANCHES]
 
     def is_new_goal(self, key: str, assignment: Assignment) -> bool:
@@ -162,7 +164,7 @@ class GoalDraws:
     def _try(self, one: KeptDifference, branch: Branch) -> GoalJump | None:
         sizes = [size for episode in self.noted.episodes for size in _sizes(one, episode[1:])]
         usual = float(np.quantile(sizes, USUAL)) if sizes else 0.0
-        jumps: list[float] = []
+        jumps: dict[bool, list[float]] = {True: [], False: []}  # at once, and in the next step
         for number, episode in enumerate(self.noted.episodes):
             step = min(BEFORE, len(episode) - 2)
             if step < 1 or not usual:
@@ -171,14 +173,16 @@ class GoalDraws:
             played = self.noted.play(number, step + 1, forced)
             if len(played) < step + 2:
                 continue
-            before, after = (max(_sizes(one, [call]), default=0.0) for call in (episode[step + 1], played[-1][0]))
-            if after > JUMP * max(usual, before) and self.kept.is_paid_at(one, number, step + 1, forced):
-                jumps.append(after)
-            if len(jumps) == NEEDED:
-                met = [number for number, is_met in branch.tests if is_met] or [branch.tests[-1][0]]
-                return GoalJump(
-                    one, branch.key, self.noted.source.expressions[met[0]].text, max(jumps), usual, len(jumps)
-                )
+            for at_once, place in ((True, step), (False, step + 1)):
+                before, after = (max(_sizes(one, [call]), default=0.0) for call in (episode[place], played[place][0]))
+                if after > JUMP * max(usual, before) and self.kept.is_paid_at(one, number, place, forced):
+                    jumps[at_once].append(after)
+                    break
+            for at_once, found in jumps.items():
+                if len(found) == NEEDED:
+                    met = [test for test, is_met in branch.tests if is_met] or [branch.tests[-1][0]]
+                    text = self.noted.source.expressions[met[0]].text
+                    return GoalJump(one, branch.key, text, at_once, max(found), usual, len(found))
         return None
 
     def force(self, branch: Branch) -> dict[int, Any]:

@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,6 +23,7 @@ LASTING_WORDS = {
 }  # fmt: skip
 SUM_WORDS = {"total", "sum", "all", "ever", "cumulative", "score"}
 AFTER = 3  # steps after a new goal
+FEW_EPISODES = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +84,53 @@ class StaleValues:
         reads = [one for one in self.noted.source.expressions if read_key(one.node) == key]
         values = {one: (before.values.get(one.number), after.values.get(one.number)) for one in reads}
         return {one: not _is_same(old[0], new[0]) for one, (old, new) in values.items() if old and new}
+
+    def find_first_only(self) -> Iterator[StaleCopy]:
+        """Yield attributes that only the first reset sets, from others that each reset sets anew."""
+        for key, assignments in self.definitions.assigned.items():
+            of_episodes = [one for one in assignments if one.function.name != "__init__"]
+            if len(of_episodes) != 1 or not self._is_once(of_episodes[0], key):
+                continue
+            (one,) = of_episodes
+            for name in sorted(self.definitions.list_reads(one.value, one.function) - {key}):
+                read = self._find_kept(key, name)
+                if read is not None:
+                    yield StaleCopy(key, name, read)
+                    return
+
+    def _is_once(self, assignment: Assignment, key: str) -> bool:
+        """Say whether an assignment stands under `if self.goal is None`, or the like, and no step runs it."""
+        for test, is_met in self.definitions.list_conditions(assignment.statement):
+            match test:
+                case ast.Compare(left=left, ops=[ast.Is() | ast.IsNot() as operator], comparators=[ast.Constant(None)]):
+                    is_missing = is_met == isinstance(operator, ast.Is)
+                case ast.UnaryOp(
+                    op=ast.Not(), operand=ast.Call(func=ast.Name(id="hasattr"), args=[_, ast.Constant(name)])
+                ):
+                    return is_met and name == key and assignment.function not in self.noted.of_steps
+                case _:
+                    continue
+            if is_missing and read_key(left) == key:
+                return assignment.function not in self.noted.of_steps
+        return False
+
+    def _find_kept(self, key: str, name: str) -> Expression | None:
+        """Return where an attribute is read that stays the same in all episodes, while another one, from which it was
+        computed, is another one in each."""
+        kept, drawn = (
+            [
+                (one, [episode[1].values[one.number][0] for episode in self.noted.episodes[:FEW_EPISODES]])
+                for one in self.noted.source.expressions
+                if read_key(one.node) == which
+                and all(len(episode) > 1 and one.number in episode[1].values for episode in self.noted.episodes)
+            ]
+            for which in (key, name)
+        )
+        is_drawn = any(
+            not _is_same(before, after) for _, values in drawn for before, after in itertools.pairwise(values)
+        )
+        same = (one for one, values in kept if all(_is_same(values[0], value) for value in values))
+        return next(same, None) if is_drawn else None
 
     def find_never_set_back(self) -> Iterator[Assignment]:
         """Yield where a time goes on that has to last without a break: no step sets it back where its condition does

@@ -10,9 +10,9 @@ from typing import Any
 
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
-from rlctl.checking.experiment import PROBE, JudgeHook, experiment
+from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
 from rlctl.checking.expressions import ExpressionRecorder, NotedCall, SourceCode, record_expressions
-from rlctl.checking.instance import Context, EnvironmentRaised
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, RuleFinding
@@ -34,7 +34,7 @@ class NotedEpisodes:
 
     source: SourceCode
     episodes: Sequence[Sequence[NotedCall]]
-    context: Context
+    instance: Instance
     recorder: ExpressionRecorder
     _times: list[float] = dataclasses.field(default_factory=list)  # of what was played again [s]
 
@@ -46,7 +46,7 @@ class NotedEpisodes:
         began = read_clock()
         if sum(self._times) > LONGEST_S:
             return []
-        player = EpisodePlayer(self.context.instance, FIRST_SEED + number, kind, number=number, max_steps=steps)
+        player = EpisodePlayer(self.instance, FIRST_SEED + number, kind, number=number, max_steps=steps)
         played: list[tuple[NotedCall, Moment]] = []
         try:
             while not player.ended or not played:
@@ -97,31 +97,36 @@ judges_expressions = JudgeHook[NotedEpisodes]()
 
 @contextlib.contextmanager
 def noted_episodes(context: Context) -> Iterator[NotedEpisodes]:
-    """Play short episodes with functions that note their expressions, as long as this lasts.
+    """Play short episodes with functions that note their expressions, as long as this lasts. The instance is a new one:
+    what is forced may lead anywhere.
 
     Raises `NotApplicable` where there is no source.
     """
-    instance = context.instance
-    source = SourceCode(instance.env)
-    if not source.expressions:
-        raise NotApplicable("its source is that of a library, or cannot be read")
+    with context.fresh() as instance:
+        source = SourceCode(instance.env)
+        if not source.expressions:
+            raise NotApplicable("its source is that of a library, or cannot be read")
+        with record_expressions(source) as recorder:
+            yield NotedEpisodes(source, _play_all(instance, recorder), instance, recorder)
+
+
+def _play_all(instance: Instance, recorder: ExpressionRecorder) -> list[list[NotedCall]]:
     episodes: list[list[NotedCall]] = []
-    with record_expressions(source) as recorder:
-        for number, kind in enumerate(EPISODES):
-            player = EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS)
-            with recorder.call(0) as noted:
-                player.reset()
-            episodes.append([noted])
-            while not player.ended:
-                with recorder.call(player.steps + 1) as noted:
-                    player.step()
-                episodes[-1].append(noted)
-            if recorder.total > MOST_NOTED or context.budget.is_over():
-                break
-        yield NotedEpisodes(source, episodes, context, recorder)
+    for number, kind in enumerate(EPISODES):
+        player = EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS)
+        with recorder.call(0) as noted:
+            player.reset()
+        episodes.append([noted])
+        while not player.ended:
+            with recorder.call(player.steps + 1) as noted:
+                player.step()
+            episodes[-1].append(noted)
+        if recorder.total > MOST_NOTED or instance.context.budget.is_over():
+            break
+    return episodes
 
 
-@experiment("expressions", PROBE, 104, share=0.2, hooks=(judges_expressions,))
+@experiment("expressions", INSTANCES, 40, share=1.0, hooks=(judges_expressions,))
 def note_expressions(context: Context) -> Iterator[ChildMessage]:
     """Show what was noted to all judges."""
     with noted_episodes(context) as noted:

@@ -23,7 +23,8 @@ RULE = Rule(
         one is drawn, the distance before is still that to the old goal. The first step towards the new goal is paid as
         if the robot had been carried away by the whole way between both: the more goals it reaches, the more it loses.
         The check put the goal at the robot, so that the environment went on to the next one; or it let the condition in
-        the source be true under which the next goal comes, and the difference to the value before then jumped.
+        the source be true under which the next goal comes, and the difference to the value before then jumped, in that
+        step or in the next one.
     """,
     fix="Compute the distance to the new goal where the goal changes, and keep that as the distance before.",
 )
@@ -49,8 +50,9 @@ class _Switch(NamedTuple):
 def _find_jumps(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in GoalDraws(KeptDifferences(noted)).find_jumps():
         difference = one.difference
-        message = f"in the step after {one.key} has changed, {difference.whole.text} is up to {one.jump:.3g}, and at"
-        message += f" most {one.usual:.3g} in nearly all other steps: {difference.key} is not computed again for the"
+        when = f"in which {one.key} changes" if one.at_once else f"after {one.key} has changed"
+        message = f"in the step {when}, {difference.whole.text} is up to {one.jump:.3g}, and at most"
+        message += f" {one.usual:.3g} in nearly all other steps: {difference.key} is not computed again for the"
         message += f" new {one.key}, which comes if {one.test}; tried in {one.episodes} episodes"
         evidence = {"element": one.key, "value": one.jump, "expected": one.usual}
         yield RuleFinding(RULE, message, evidence, where=difference.whole.where)

@@ -28,7 +28,8 @@ RULE = Rule(
         reward pays for another: a policy that does what it sees earns nothing. One goal after the other was replaced
         while the same episode was played: in the same steps only one of them changed the observations, and only
         another one changed the rewards. Or reset copies a goal or a command into another attribute, and steps still
-        read the copy after another one was drawn: the check let the condition be true under which that happens.
+        read the copy after another one was drawn: the check let the condition be true under which that happens. Or only
+        the first reset computes a value, as under `if self.goal is None`, from another one that each reset sets anew.
     """,
     fix="Choose the goal in one place, which the observation, the reward and the success read.",
 )
@@ -41,9 +42,14 @@ SAME = 1e-6  # differences that do not count, of the numbers or of 1
 
 @judges_expressions(RULE, decides=False)
 def _find_stale_copies(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one in StaleValues(GoalDraws(KeptDifferences(noted))).find_stale_copies():
+    stale = StaleValues(GoalDraws(KeptDifferences(noted)))
+    for one in stale.find_stale_copies():
         message = f"reset copies {one.goal} into {one.copy}, which steps still read after {one.goal} has changed:"
         message += f" {one.read.text} is then that of the last {one.goal}"
+        yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
+    for one in stale.find_first_only():
+        message = f"only the first reset computes {one.copy} from {one.goal}, and each reset sets {one.goal} anew:"
+        message += f" {one.read.text} is that of the first episode"
         yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
 
 

@@ -46,7 +46,7 @@ in the observation; or nothing."""
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    shape = getattr(noted.context.instance.env.action_space, "shape", None)
+    shape = getattr(noted.instance.env.action_space, "shape", None)
     size = int(np.prod(shape or 0))
     yield from itertools.islice(find_unread_elements(RULE, noted.source, noted.of_steps, size), 1)
 
