@@ -2,8 +2,9 @@
 
 import ast
 import dataclasses
+import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -88,7 +89,7 @@ class StaleValues:
     def find_first_only(self) -> Iterator[StaleCopy]:
         """Yield attributes that only the first reset sets, from others that each reset sets anew."""
         for key, assignments in self.definitions.assigned.items():
-            of_episodes = [one for one in assignments if one.function.name != "__init__"]
+            of_episodes = [one for one in assignments if one.function in self._of_resets]
             if len(of_episodes) != 1 or not self._is_once(of_episodes[0], key):
                 continue
             (one,) = of_episodes
@@ -98,9 +99,17 @@ class StaleValues:
                     yield StaleCopy(key, name, read)
                     return
 
+    @functools.cached_property
+    def _of_resets(self) -> Collection[ast.AST]:
+        calls = [episode[0] for episode in self.noted.episodes]
+        return {self.noted.source.expressions[number].function for call in calls for number in call.values}
+
     def _is_once(self, assignment: Assignment, key: str) -> bool:
-        """Say whether an assignment stands under `if self.goal is None`, or the like, and no step runs it."""
-        for test, is_met in self.definitions.list_conditions(assignment.statement):
+        """Say whether an assignment, or a call of its function, stands under `if self.goal is None`, or the like, and
+        no step runs it."""
+        calls = [call for call, caller in self.definitions.calls[assignment.function.name] if caller in self._of_resets]
+        places = [assignment.statement, *calls[: len(calls) == 1]]
+        for test, is_met in [pair for place in places for pair in self.definitions.list_conditions(place)]:
             match test:
                 case ast.Compare(left=left, ops=[ast.Is() | ast.IsNot() as operator], comparators=[ast.Constant(None)]):
                     is_missing = is_met == isinstance(operator, ast.Is)

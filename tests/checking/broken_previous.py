@@ -347,3 +347,61 @@ class BoatOnCommand(Boat):
 class RL638BoatOnCommandShowsTheFirst(BoatOnCommand):
     def get_shown(self):
         return self.shown
+
+
+class RL627BoatInTimeBuoyFirst(BoatInTime):
+    """The next buoy comes before the progress to it is computed."""
+
+    def reward(self):
+        if self.steps % 30 == 0:
+            self.buoy = self.draw_buoy()
+        return Boat.reward(self) + self.gain()
+
+    def gain(self):
+        distance = self.distance()
+        progress = self.prev_distance - distance
+        self.prev_distance = distance
+        return progress
+
+
+class BoatShowsItsWay(Boat):
+    """It observes the way to a place beside the buoy."""
+
+    target = None
+
+    def start(self):
+        super().start()
+        self.aim()
+
+    def aim(self):
+        self.target = self.buoy + [0.1, 0.0]
+
+    def size(self):
+        return 8
+
+    def observe(self):
+        return np.concatenate([super().observe(), self.target - self.place]).astype(np.float32)
+
+
+class RL638BoatKeepsItsFirstWay(BoatShowsItsWay):
+    def aim(self):
+        if self.target is None:
+            self.target = self.buoy + [0.1, 0.0]
+
+
+class BoatFromItsBow(BoatShowsItsWay):
+    """Distances are those of the bow, which is ahead of its place."""
+
+    def bow(self):
+        return self.place + [0.15, 0.0]
+
+    def distance(self):
+        return float(np.linalg.norm(self.target - self.bow()))
+
+    def observe(self):
+        return np.concatenate([Boat.observe(self), self.target - self.bow()]).astype(np.float32)
+
+
+class RL626BoatFromBothEnds(BoatFromItsBow):
+    def observe(self):
+        return np.concatenate([Boat.observe(self), self.target - self.place]).astype(np.float32)

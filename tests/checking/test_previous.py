@@ -1,4 +1,4 @@
-"""RL620, RL627, RL628, RL637, RL638, RL641: values that the source keeps from step to step."""
+"""RL620, RL626, RL627, RL628, RL637, RL638, RL641: values that the source keeps from step to step."""
 
 import pytest
 
@@ -16,12 +16,15 @@ PAIRS = {
     "RL620BoatNormedTooEarly": "BoatNormed",
     "RL627BoatOnCourseOldBuoy": "BoatOnCourse",
     "RL627BoatInTimeOldBuoy": "BoatInTime",
+    "RL627BoatInTimeBuoyFirst": "BoatInTime",
     "RL627BoatsMaskOldGoal": "BoatsMask",
     "RL627BoatsWhereOldGoal": "BoatsWhere",
     "RL628BoatPaddlesInEachStep": "BoatPaddles",
     "RL628BoatPaddlesAtOnceInEachStep": "BoatPaddlesAtOnce",
     "RL637BoatAheadFromTheStart": "BoatAhead",
+    "RL626BoatFromBothEnds": "BoatFromItsBow",
     "RL638BoatOnCommandShowsTheFirst": "BoatOnCommand",
+    "RL638BoatKeepsItsFirstWay": "BoatShowsItsWay",
     "RL641BoatStaysNowAndThen": "BoatStays",
     "RL641BoatStaysMaskedNowAndThen": "BoatStaysMasked",
 }
