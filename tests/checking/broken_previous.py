@@ -374,7 +374,7 @@ class BoatShowsItsWay(Boat):
         self.aim()
 
     def aim(self):
-        self.target = self.buoy + [0.1, 0.0]
+        self.target = self.buoy + np.array([0.1, 0.0])
 
     def size(self):
         return 8
@@ -386,14 +386,14 @@ class BoatShowsItsWay(Boat):
 class RL638BoatKeepsItsFirstWay(BoatShowsItsWay):
     def aim(self):
         if self.target is None:
-            self.target = self.buoy + [0.1, 0.0]
+            self.target = self.buoy + np.array([0.1, 0.0])
 
 
 class BoatFromItsBow(BoatShowsItsWay):
     """Distances are those of the bow, which is ahead of its place."""
 
     def bow(self):
-        return self.place + [0.15, 0.0]
+        return self.place + np.array([0.15, 0.0])
 
     def distance(self):
         return float(np.linalg.norm(self.target - self.bow()))

@@ -7,11 +7,27 @@ from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from rlctl.checking.records import Records
 from rlctl.checking.rule import RuleFinding
 from rlctl.checking.rules import RULES
-from tests.checking.judging import findings, records_of
+from tests.checking.judging import case, check_case, findings, mark_slow, records_of
 
 TURNED = ["RL124KiteDown", "RL124KiteNorth", "RL125KiteWay", "RL124KiteLens", "RL125BargeWay", "RL701BargeCopied"]
 TURNED += ["RL129SkiffWayInTheWorld"]
+CASES = [
+    case(f"broken_lines.py:{name}", (name[:5], "warning"), twin=f"broken_lines.py:{twin}", slow=True)
+    for name in TURNED
+    for twin in ("Kite", "Barge", "Skiff")
+    if twin in name
+]
 COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLeftTwice", "RL835BipedTwoOfTheRight"]
+CASES += [
+    case(f"broken_ids.py:{name}", (name[:5], "warning"), twin="broken_ids.py:Biped", slow=True) for name in COMPARED
+]
+
+
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    if case.broken.startswith("broken_ids"):
+        pytest.importorskip("mujoco")
+    check_case(case)
 
 
 def find_rules(task):

@@ -29,7 +29,7 @@ PAIRS = {
     "RL641BoatStaysMaskedNowAndThen": "BoatStaysMasked",
 }
 CASES = [
-    case(f"{FILE}:RL641BoatStaysNowAndThen", ("RL641", "warning"), twin=f"{FILE}:BoatStays", slow=True),
+    case(f"{FILE}:{name}", (name[:5], "warning"), twin=f"{FILE}:{twin}", slow=True) for name, twin in PAIRS.items()
 ]
 
 
