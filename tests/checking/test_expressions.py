@@ -9,9 +9,13 @@ import gymnasium
 import numpy as np
 import pytest
 
+from rlctl.checking import children
+from rlctl.checking.experiment import PROBE
 from rlctl.checking.expressions import SourceCode, record_expressions
+from rlctl.checking.records import Finished, Skipped
 from rlctl.checking.step_times import StepTimes
 from rlctl.checking.timed_expressions import Use, find_majority, find_timed_expressions
+from rlctl.environments.spec import EnvSpec
 
 DT, SUBSTEPS = 0.1, 5
 H = DT / SUBSTEPS
@@ -167,3 +171,29 @@ def test_an_environment_of_a_library_has_no_source():
 def test_a_module_that_is_not_a_file_is_left_out(monkeypatch):
     monkeypatch.setitem(sys.modules, "nowhere", SimpleNamespace(__file__=None))
     assert {Path(file).name for file in SourceCode(Cart()).trees} >= {"test_expressions.py"}
+
+
+DEEP = """
+import gymnasium
+from gymnasium import spaces
+
+
+class Deep(gymnasium.Env):
+    observation_space = action_space = spaces.Box(-1.0, 1.0, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.observation_space.sample()
+        return self.x, {}
+
+    def step(self, action):
+        return self.x, float(SUM), False, False, {}
+"""
+
+
+def test_a_source_that_is_nested_too_deeply_is_not_judged(tmp_path):
+    (tmp_path / "deep.py").write_text(DEEP.replace("SUM", " + ".join(["self.x[0]"] * 1500)))
+    messages = list(children.run(PROBE, EnvSpec(f"{tmp_path}/deep.py:Deep"), ["build", "expressions"], 10.0))
+    reasons = {message.reason for message in messages if isinstance(message, Skipped)}
+    assert reasons == {children.TOO_DEEP}
+    assert [message.crash for message in messages if isinstance(message, Finished)] == ["", ""]
