@@ -139,7 +139,9 @@ def find_short_commands(watched: WatchedWorlds) -> Iterator[ShortCommand]:
         return
     again, other = (logger.play(action_seed=FIRST_SEED + number, steps=COMPARED) for number in (0, 1))
     for key in sorted(short, key=str):
-        one, same, changed = ([log.read_values(_name(key, log)) for log in each[:COMPARED]] for each in (logs, again, other))
+        one, same, changed = (
+            [log.read_values(_name(key, log)) for log in each[:COMPARED]] for each in (logs, again, other)
+        )
         if _are_equal(one, same) and not _are_equal(one, changed):
             place = next(place for log in logs for _, _, place in log.commands.get(key, ()))
             if place is None or not IMPULSES.search(linecache.getline(place.file, place.line)):
