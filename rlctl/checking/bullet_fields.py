@@ -176,6 +176,13 @@ class BulletFields:
                     pass
                 case ast.Attribute():  # `.copy()`
                     pass
+                case ast.Tuple(elts=parts) if isinstance(self._source.parents[above], ast.Assign):
+                    targets = self._source.parents[above].targets  # type: ignore[attr-defined]
+                    several = [
+                        one.elts for one in targets if isinstance(one, ast.Tuple) and len(one.elts) == len(parts)
+                    ]
+                    place = [part is below for part in parts].index(True)
+                    return [read_name(elements[place]) for elements in several]
                 case ast.Assign(targets=targets):
                     return [name for target in targets if (name := read_name(target))]
                 case ast.AugAssign(target=target, op=ast.Add()) | ast.AnnAssign(target=target):

@@ -194,7 +194,7 @@ class Slider(Robot):
             p.stepSimulation(physicsClientId=self.cid)
 
     def is_success(self):
-        return False
+        return bool(np.abs(self.goals - self.states()[0]).max() < 0.15)
 
     def reward(self):
         return -float(np.abs(self.goals - self.states()[0]).sum())
