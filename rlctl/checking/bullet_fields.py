@@ -1,14 +1,13 @@
 """Which fields of the tuples that PyBullet returns the source reads, and what it calls them."""
 
 import ast
-import collections
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
-from rlctl.checking.assignments import Assignments
-from rlctl.checking.expressions import Function, SourceCode
-from rlctl.checking.summands import read_name
+from rlctl.checking.assignments import read_name
+from rlctl.checking.definitions import Definitions
+from rlctl.checking.expressions import Function
+from rlctl.checking.noted_numbers import NotedNumbers
 from rlctl.checking.term_names import split_name
 
 PLACE, TURN = {"pos", "position", "positions"}, {"orn", "orientation", "quat", "quaternion"}
@@ -62,8 +61,8 @@ class ReadField:
 class BulletFields:
     """The tuples of PyBullet in a source."""
 
-    def __init__(self, source: SourceCode) -> None:
-        self._source, self._assignments = source, Assignments(source)
+    def __init__(self, definitions: Definitions) -> None:
+        self._source, self._definitions = definitions.source, definitions
 
     def find_row(self, node: ast.expr, depth: int = 0) -> str:
         """Return the function of PyBullet of which an expression is one tuple; empty for others."""
@@ -72,7 +71,7 @@ class BulletFields:
         match node:
             case ast.Call(func=function):
                 name = read_name(function)
-                returned = self._assignments.list_returned(function)
+                returned = self._definitions.read_returned(node)
                 own = self._agree([self.find_row(value, depth + 1) for value in returned])
                 return name if name in FIELDS.keys() - LISTS else own
             case ast.Subscript(value=owner, slice=ast.Slice(lower=None | ast.Constant(value=0))):
@@ -82,7 +81,7 @@ class BulletFields:
             case ast.Name() if (loop := self._find_loop(node)) is not None:
                 return self.find_list(loop, depth + 1)
             case ast.Name() | ast.Attribute():
-                return self._agree([self.find_row(value, depth + 1) for value in self._assignments.read(node)])
+                return self._agree([self.find_row(value, depth + 1) for value in self._definitions.read(node)])
         return ""
 
     def find_list(self, node: ast.expr, depth: int = 0) -> str:
@@ -96,7 +95,7 @@ class BulletFields:
                     return ROWS.get(name, name)
                 if name in ("list", "tuple", "enumerate", "reversed") and args:
                     return self.find_list(args[0], depth + 1)
-                returned = self._assignments.list_returned(function)
+                returned = self._definitions.read_returned(node)
                 return self._agree([self.find_list(value, depth + 1) for value in returned])
             case ast.BoolOp(values=[first, *_]) | ast.Subscript(value=first, slice=ast.Slice()):
                 return self.find_list(first, depth + 1)
@@ -107,7 +106,7 @@ class BulletFields:
             case ast.Name() if self._find_loop(node) is not None:
                 return ""
             case ast.Name() | ast.Attribute():
-                return self._agree([self.find_list(value, depth + 1) for value in self._assignments.read(node)])
+                return self._agree([self.find_list(value, depth + 1) for value in self._definitions.read(node)])
         return ""
 
     def _agree(self, found: Sequence[str]) -> str:
@@ -138,7 +137,7 @@ class BulletFields:
             case ast.ListComp(elt=part) | ast.GeneratorExp(elt=part) if depth < DEEPEST:
                 return self.find_field(part, depth + 1)
             case ast.Name() if self._find_loop(node) is None and depth < DEEPEST:
-                values = self._assignments.read(node)
+                values = self._definitions.read(node)
                 return self.find_field(values[0], depth + 1) if len(values) == 1 else None
         return None
 
@@ -194,12 +193,14 @@ class BulletFields:
                     return [self._source.find_function(above).name]
                 case _:
                     return []
-            below, above = above, self._source.parents[above]  # type: ignore[assignment]
+            below, above = above, self._source.parents[above]
 
 
-def find_taken_for_force(source: SourceCode, functions: Sequence[Function]) -> Iterator[tuple[ast.Compare, float]]:
+def find_taken_for_force(
+    definitions: Definitions, functions: Sequence[Function], numbers: NotedNumbers
+) -> Iterator[tuple[ast.Compare, float]]:
     """Yield comparisons in which the distance of a contact point has to be larger than it can be, and what than."""
-    fields, constants = BulletFields(source), _read_constants(source)
+    fields = BulletFields(definitions)
     for node in (node for function in functions for node in ast.walk(function)):
         match node:
             case ast.Compare(left=one, ops=[ast.Gt() | ast.GtE()], comparators=[bound]):
@@ -208,25 +209,11 @@ def find_taken_for_force(source: SourceCode, functions: Sequence[Function]) -> I
                 pass
             case _:
                 continue
-        least = bound.value if isinstance(bound, ast.Constant) else constants.get(read_name(bound))
+        least = numbers.read_constant(bound)
         read = fields.find_field(one)
         is_distance = read is not None and (read.function, read.field) == ("getContactPoints", DISTANCE)
-        if is_distance and isinstance(least, int | float) and least >= FARTHEST:
+        if is_distance and least is not None and least >= FARTHEST:
             yield node, least
-
-
-def _read_constants(source: SourceCode) -> dict[str, Any]:
-    """Return the numbers that names and attributes have which are assigned once."""
-    found = collections.defaultdict[str, list[ast.expr]](list)
-    for tree in source.trees.values():
-        for node in ast.walk(tree):
-            match node:
-                case (
-                    ast.Assign(targets=[target], value=value) | ast.AnnAssign(target=target, value=ast.expr() as value)
-                ):
-                    found[read_name(target)].append(value)
-    once = {name: values[0] for name, values in found.items() if len(values) == 1}
-    return {name: value.value for name, value in once.items() if isinstance(value, ast.Constant)}
 
 
 def find_other_meaning(read: ReadField, name: str) -> tuple[str, str, int] | None:

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.data_flow import Assignment, read_key, read_words
+from rlctl.checking.assignments import Assignment, read_key, read_name, read_words
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Expression, Function, NotedCall
 from rlctl.checking.previous_values import PREVIOUS_WORDS, KeptDifference, KeptDifferences, is_goal
-from rlctl.checking.summands import read_name
 from rlctl.checking.term_names import split_name
 
 NOMINAL_WORDS = {
@@ -74,7 +74,8 @@ class EarlyReadings:
     """Those of a source."""
 
     def __init__(self, differences: KeptDifferences) -> None:
-        self.noted, self.flow, self._differences = differences.noted, differences.flow, differences.differences
+        self.noted, self._differences = differences.noted, differences.differences
+        self.definitions = differences.definitions
         of_resets = [call for episode in self.noted.episodes for call in episode[:1]]
         self._run = {self.noted.source.expressions[number].function for call in of_resets for number in call.values}
 
@@ -99,15 +100,14 @@ class EarlyReadings:
 
     def _list_candidates(self) -> Iterator[_Candidate]:
         subtracted = {one.key for one in self._differences}
-        for key, assignments in self.flow.assigned.items():
+        for key, assignments in self.definitions.assigned.items():
             for one in assignments:
                 value = self.noted.source.find(one.value)
-                is_plain = isinstance(one.statement, ast.Assign) and isinstance(
-                    one.target, ast.Attribute | ast.Subscript
-                )
+                is_plain = one.element is None and not one.is_part and isinstance(one.statement, ast.Assign)
+                is_plain &= isinstance(one.target, ast.Attribute | ast.Subscript)
                 if key not in subtracted or value is None or not is_plain or one.function not in self._run:
                     continue
-                opened = _OpenedNames(one)
+                opened = _OpenedNames(self.definitions, one)
                 again = opened.visit(copy.deepcopy(one.value))
                 if is_goal(key) or is_goal(read_key(one.value)) or not self._may_be_repeated(one, again):
                     continue
@@ -138,7 +138,7 @@ class EarlyReadings:
                     owners = set(split_name(ast.unparse(function)))
                     if not name or owners & CHANCE_WORDS or name in CLOCKS or name.lstrip("_").startswith(CHANGING):
                         return False
-                    inner = self.flow.functions.get(name, ())
+                    inner = self.definitions.functions.get(name, ())
                     if inner and (depth > DEEPEST or not all(self._is_pure(one, depth + 1) for one in inner)):
                         return False
         return True
@@ -167,35 +167,26 @@ class EarlyReadings:
 class _OpenedNames(ast.NodeTransformer):
     """Replaces the local names of what is assigned by the expressions that they stand for."""
 
-    def __init__(self, assignment: Assignment) -> None:
+    def __init__(self, definitions: Definitions, assignment: Assignment) -> None:
         self.origins: list[ast.expr] = []
         self.is_known = True  # whether each name stands for one expression only
-        self._values: dict[str, list[tuple[ast.expr, int | None]]] = {}
-        for node in ast.walk(assignment.function):
-            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-                self._values.setdefault(node.id, [])
-        for node in ast.walk(assignment.function):
-            if isinstance(node, ast.Assign):
-                for target in node.targets:
-                    for place, part in enumerate(target.elts) if isinstance(target, ast.Tuple) else [(None, target)]:
-                        if isinstance(part, ast.Name):
-                            self._values[part.id].append((node.value, place))
+        self._assigned = definitions.list_assigned(assignment.function)
         self._depth = 0
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
         """Replace a name that is assigned once."""
-        values = self._values.get(node.id)
-        if values is None:
+        several = self._assigned.get(node.id)
+        if several is None:
             return node
-        if len(values) != 1 or self._depth > DEEPEST:
+        one = several[0]
+        if len(several) > 1 or one.added or not one.is_known or self._depth > DEEPEST:
             self.is_known = False
             return node
-        ((value, place),) = values
-        self.origins.append(value)
+        self.origins.append(one.value)
         self._depth += 1
-        opened = self.visit(copy.deepcopy(value))
+        opened: ast.expr = self.visit(copy.deepcopy(one.value))
         self._depth -= 1
-        return opened if place is None else ast.Subscript(opened, ast.Constant(place), ast.Load())
+        return opened if one.element is None else ast.Subscript(opened, ast.Constant(one.element), ast.Load())
 
 
 class _ResetWatch(contextlib.AbstractContextManager["_ResetWatch"]):

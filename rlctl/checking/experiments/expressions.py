@@ -71,10 +71,12 @@ class NotedEpisodes:
         """The functions that steps run."""
         return {self.source.expressions[number].function for call in self.steps for number in call.values}
 
-    @property
+    @functools.cached_property
     def functions(self) -> list[Function]:
         """All functions of the source that were run."""
-        return [one for named in self.source.functions.values() for one in named if one in self._evaluated]
+        calls = [call for episode in self.episodes for call in episode]
+        run = dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)
+        return list(run)
 
     @property
     def steps(self) -> list[NotedCall]:

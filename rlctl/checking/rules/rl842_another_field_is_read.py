@@ -26,7 +26,7 @@ RULE = Rule(
 @judges_expressions(RULE)
 def _find_other_fields(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     source = noted.source
-    for read, names in BulletFields(source).list_read(noted.functions):
+    for read, names in BulletFields(noted.definitions).list_read(noted.functions):
         for name in names:
             if (found := find_other_meaning(read, name)) is None:
                 continue
