@@ -11,6 +11,12 @@ from tests.checking.judging import findings, records_of
 
 TURNED = ["RL124KiteDown", "RL124KiteNorth", "RL125KiteWay", "RL124KiteLens", "RL125BargeWay", "RL701BargeCopied"]
 TURNED += ["RL129SkiffWayInTheWorld"]
+DINGHIES = {
+    "RL129DinghyVelocity": "Dinghy",
+    "RL129DinghyClipped": "Dinghy",
+    "RL129DinghyScaled": "DinghyScaled",
+    "RL129DinghyZipped": "DinghyZipped",
+}
 COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLeftTwice", "RL835BipedTwoOfTheRight"]
 
 
@@ -23,6 +29,13 @@ def find_rules(task):
 @pytest.mark.parametrize("name", TURNED)
 def test_a_line_turns_a_vector_the_wrong_way_or_leaves_out_an_element_of_the_action(name):
     assert find_rules(f"broken_lines.py:{name}") == {name[:5]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DINGHIES)
+def test_a_vector_of_the_world_is_observed_with_noise(name):
+    assert find_mistakes(f"broken_dinghies.py:{name}") == {"RL129"}
+    assert find_mistakes(f"broken_dinghies.py:{DINGHIES[name]}") == set()
 
 
 @pytest.mark.slow
