@@ -5,6 +5,8 @@ import pytest
 from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from tests.checking.judging import case, check_case, findings, mark_slow, records_of
 
+pytest.importorskip("mujoco")
+
 FILE = "broken_early.py"
 PAIRS = {
     "RL642RaftKeepsFirst": "Raft",
@@ -13,7 +15,9 @@ PAIRS = {
     "RL642LanderBeginsFirst": "Lander",
     "RL642LanderUnpacksFirst": "Lander",
 }
-CASES = [case(f"{FILE}:RL642PuckDistanceBeforeTheSpot", ("RL642", "warning"), twin=f"{FILE}:Puck", slow=True)]
+CASES = [
+    case(f"{FILE}:RL642PuckDistanceBeforeTheSpot", ("RL642", "warning"), twin=f"{FILE}:Puck", pybullet=True, slow=True)
+]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
@@ -23,7 +27,6 @@ def test_finds_the_mistake_and_only_that(case):
 
 def read_source(name):
     """Return the rules that find something in the expressions of a class."""
-    pytest.importorskip("mujoco")
     records = records_of(f"{FILE}:{name}", "build", "expressions")
     return {one.rule for one in records.facts[BY_EXPRESSIONS]}
 
@@ -46,6 +49,5 @@ def test_what_happens_in_between_and_what_is_read_of_the_last_episode(name):
 @pytest.mark.slow
 @pytest.mark.pybullet
 def test_names_both_values():
-    pytest.importorskip("mujoco")
     (finding,) = findings(f"{FILE}:RL642RaftHeadingOfTheModel", "RL642")
     assert finding.message.startswith("self.heading = start_yaw reads 0, and at the end of the same reset start_yaw is")

@@ -34,8 +34,8 @@ def test_a_line_turns_a_vector_the_wrong_way_or_leaves_out_an_element_of_the_act
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DINGHIES)
 def test_a_vector_of_the_world_is_observed_with_noise(name):
-    assert find_mistakes(f"broken_dinghies.py:{name}") == {"RL129"}
-    assert find_mistakes(f"broken_dinghies.py:{DINGHIES[name]}") == set()
+    assert find_rules(f"broken_dinghies.py:{name}") == {"RL129"}
+    assert find_rules(f"broken_dinghies.py:{DINGHIES[name]}") == set()
 
 
 @pytest.mark.slow

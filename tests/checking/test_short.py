@@ -4,6 +4,8 @@ import pytest
 
 from tests.checking.judging import case, check_case, findings, found, mark_slow
 
+pytest.importorskip("mujoco")
+
 FILE = "broken_short.py"
 PAIRS = {
     "RL838PodPushesOnce": "Pod",
@@ -27,7 +29,6 @@ def test_finds_the_mistake_and_only_that(case):
 @pytest.mark.pybullet
 @pytest.mark.parametrize("name", PAIRS)
 def test_finds_commands_of_one_physics_step(name):
-    pytest.importorskip("mujoco")
     assert found(f"{FILE}:{name}", "RL838") == {("RL838", "warning")}
     assert found(f"{FILE}:{PAIRS[name]}", "RL838") == set()
 
