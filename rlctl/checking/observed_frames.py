@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 OBSERVERS = {"observe", "_observe"}  # of tasks, which have no step of their own
 PASSED_ON = {
     "append", "clip", "column_stack", "concatenate", "dict", "hstack", "items", "list", "reshape", "stack", "tuple",
-    "values", "vstack", *CONVERSIONS,
+    "values", "vstack", "zip", "enumerate", *CONVERSIONS,
 }  # fmt: skip
 SEEN_WORDS = {"ray", "rays", "scan", "scans", "lidar", "camera", "image", "pixels", "ranges", "sonar"}
 DEEPEST = 14
@@ -93,7 +93,7 @@ class ObservedCode:
             case ast.IfExp(body=body, orelse=other):
                 return [body, other]
             case ast.Name():
-                return [*self._definitions.read(node), *self._definitions.read_parts(node)]
+                return [*self._definitions.read(node), *self._definitions.read_parts(node), *self._list_appended(node)]
             case ast.Call(func=function, args=args, keywords=keywords):
                 name = ast.unparse(function).rsplit(".", 1)[-1]
                 owner = [function.value] if isinstance(function, ast.Attribute) else []
@@ -102,6 +102,17 @@ class ObservedCode:
                     return [*owner, *given]
                 return [*self._definitions.read_returned(node), *(one for one in given if self._is_like(node, one))]
         return []
+
+    def _list_appended(self, name: ast.Name) -> list[ast.expr]:
+        """Return what is appended to a list."""
+        found: list[ast.expr] = []
+        for node in ast.walk(self._series.source.find_function(name)):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="append" | "extend", value=ast.Name(id=text)), args=args) if (
+                    text == name.id
+                ):
+                    found += args
+        return found
 
     def _is_like(self, whole: ast.expr, part: ast.expr) -> bool:
         """Say whether a function returns as many elements as an argument has: it may add noise."""

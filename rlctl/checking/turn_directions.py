@@ -107,7 +107,8 @@ class Directions:
                 order = WXYZ if "mujoco" in self._libraries else XYZW
                 yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
                 return yaw.reshape(rows.shape[:2])
-        return next((rows for one, rows in self._angles if one.text == text), None)
+        angles = [rows for one, rows in self._angles if one.text == text]
+        return max(angles, key=lambda rows: np.isfinite(rows).sum(), default=None)  # some are read at resets only
 
     @functools.cached_property
     def _angles(self) -> list[tuple[Expression, Array]]:

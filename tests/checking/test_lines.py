@@ -17,7 +17,17 @@ CASES = [
     for twin in ("Kite", "Barge", "Skiff")
     if twin in name
 ]
+DINGHIES = {
+    "RL129DinghyVelocity": "Dinghy",
+    "RL129DinghyClipped": "Dinghy",
+    "RL129DinghyScaled": "DinghyScaled",
+    "RL129DinghyZipped": "DinghyZipped",
+}
 COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLeftTwice", "RL835BipedTwoOfTheRight"]
+CASES += [
+    case(f"broken_dinghies.py:{name}", ("RL129", "warning"), twin=f"broken_dinghies.py:{twin}", slow=True)
+    for name, twin in DINGHIES.items()
+]
 CASES += [
     case(f"broken_ids.py:{name}", (name[:5], "warning"), twin="broken_ids.py:Biped", slow=True) for name in COMPARED
 ]
@@ -39,6 +49,13 @@ def find_rules(task):
 @pytest.mark.parametrize("name", TURNED)
 def test_a_line_turns_a_vector_the_wrong_way_or_leaves_out_an_element_of_the_action(name):
     assert find_rules(f"broken_lines.py:{name}") == {name[:5]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DINGHIES)
+def test_a_vector_of_the_world_is_observed_with_noise(name):
+    assert find_rules(f"broken_dinghies.py:{name}") == {"RL129"}
+    assert find_rules(f"broken_dinghies.py:{DINGHIES[name]}") == set()
 
 
 @pytest.mark.slow

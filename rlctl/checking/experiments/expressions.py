@@ -11,7 +11,7 @@ from typing import Any
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
-from rlctl.checking.expressions import ExpressionRecorder, NotedCall, SourceCode, record_expressions
+from rlctl.checking.expressions import ExpressionRecorder, Function, NotedCall, SourceCode, record_expressions
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
@@ -70,6 +70,13 @@ class NotedEpisodes:
     def of_steps(self) -> Collection[ast.AST]:
         """The functions that steps run."""
         return {self.source.expressions[number].function for call in self.steps for number in call.values}
+
+    @functools.cached_property
+    def functions(self) -> list[Function]:
+        """All functions of the source that were run."""
+        calls = [call for episode in self.episodes for call in episode]
+        run = dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)
+        return list(run)
 
     @property
     def steps(self) -> list[NotedCall]:

@@ -1,11 +1,13 @@
 """RL834: contact is never seen."""
 
+import ast
 import itertools
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from rlctl.checking.bullet_fields import find_taken_for_force
 from rlctl.checking.compared_ids import find_wrong_ids
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -50,7 +52,18 @@ MEANT_WORDS = {"on", "in", "flag", "flags", "force", "forces", "sensor", "sensor
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    yield from itertools.islice(find_wrong_ids(RULE, noted.definitions, noted.episodes), 1)
+    found = itertools.chain(find_wrong_ids(RULE, noted.definitions, noted.episodes), _find_distances(noted))
+    yield from itertools.islice(found, 1)
+
+
+def _find_distances(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    """Yield where the distance of a contact point has to be larger than it can be, as a force has to."""
+    for node, least in find_taken_for_force(noted.definitions, noted.functions, noted.reward.numbers):
+        text = " ".join(ast.unparse(node).split())
+        message = f"{text} is never true: field 8 of a contact point is the distance, below 0 where bodies touch, and"
+        message += f" {least:g} m apart there is no contact; the normal force is field 9"
+        place = noted.source.find_place(noted.source.find_statement(node))[0], node.lineno
+        yield RuleFinding(RULE, message, {"element": text, "value": least}, where=place)
 
 
 @judges_trials(RULE, place=31)
