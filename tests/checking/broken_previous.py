@@ -27,6 +27,8 @@ class BoatAhead(Boat):
 
 
 class RL637BoatAheadFromTheStart(BoatAhead):
+    rlctl_ignore = {"RL605": "what was paid once is paid until the end"}
+
     def keep(self, distance):
         pass
 
@@ -188,6 +190,8 @@ class BoatsMask(BoatOnCourse):
 
 
 class RL627BoatsMaskOldGoal(BoatsMask):
+    rlctl_ignore = {"RL114": "the last distance is hidden", "RL611": "goals are drawn without end"}
+
     def draw_goals(self, arrived):
         self.goals[arrived] = self.np_random.uniform(-1, 1, (arrived.sum(), 2))
 
@@ -209,6 +213,8 @@ class BoatsWhere(BoatsMask):
 
 
 class RL627BoatsWhereOldGoal(BoatsWhere):
+    rlctl_ignore = {"RL114": "the last distance is hidden", "RL611": "goals are drawn without end"}
+
     def kept(self, distances):
         return distances
 
@@ -345,12 +351,16 @@ class BoatOnCommand(Boat):
 
 
 class RL638BoatOnCommandShowsTheFirst(BoatOnCommand):
+    rlctl_ignore = {"RL615": "the command changes, and nothing shows it"}
+
     def get_shown(self):
         return self.shown
 
 
 class RL627BoatInTimeBuoyFirst(BoatInTime):
     """The next buoy comes before the progress to it is computed."""
+
+    rlctl_ignore = {"RL611": "its buoys move on too often"}
 
     def reward(self):
         if self.steps % 30 == 0:
