@@ -247,7 +247,16 @@ class _ResetWatch(contextlib.AbstractContextManager["_ResetWatch"]):
         nodes = [self._noted.source.expressions[number].node for number, _ in call.events[first:]]
         if any(isinstance(node, ast.Call) and read_name(node.func) in PHYSICS for node in nodes):
             return None
+        if self._moves_on(one, {self._noted.source.expressions[number].function for number, _ in call.events[first:]}):
+            return None
         return kept, later
+
+    def _moves_on(self, one: _Candidate, run: set[Function]) -> bool:
+        """Say whether one of the functions that were run moves the robot as steps do, such as to let it settle."""
+        definitions = self._noted.definitions
+        keys = definitions.list_reads(one.assignment.value, one.assignment.function)
+        of_steps = [function for function in run if function in self._noted.of_steps]
+        return any(definitions.list_sets(function) & keys for function in of_steps)
 
 
 def _run(node: ast.expr, scope: tuple[dict[str, Any], Mapping[str, Any]]) -> Any:

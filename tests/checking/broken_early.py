@@ -160,6 +160,16 @@ class RL642PuckDistanceBeforeTheSpot(Puck):
         return gained
 
 
+class PuckGlides(Puck):
+    """It glides for a while after it has been placed, without an engine."""
+
+    def start(self):
+        self.state = self.draw()
+        self.prev_distance = self.distance()
+        for _ in range(5):
+            self.move(np.ones(2))
+
+
 class Lander(Robot):
     """It is paid for what it climbs from where it starts. PyBullet."""
 

@@ -41,7 +41,7 @@ def test_finds_what_is_read_too_early(name):
 
 @pytest.mark.slow
 @pytest.mark.pybullet
-@pytest.mark.parametrize("name", ["RaftSettles", "RaftLevels"])
+@pytest.mark.parametrize("name", ["RaftSettles", "RaftLevels", "PuckGlides"])
 def test_what_happens_in_between_and_what_is_read_of_the_last_episode(name):
     assert "RL642" not in read_source(name)
 
