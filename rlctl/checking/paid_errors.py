@@ -56,6 +56,10 @@ class ErrorReader:
         self._sized = set(_list_sized(notes))
         self._directed = set(_list_directed(notes))
 
+    def is_sized(self, text: str) -> bool:
+        """Say whether the source takes the size of an expression somewhere."""
+        return text in self._sized
+
     def find_errors(self) -> Iterator[SignedError]:
         """Yield the differences with a sign in the reward."""
         for summand in self.reward.summands:

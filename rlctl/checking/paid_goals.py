@@ -74,7 +74,7 @@ class GoalReader:
                 words = self._list_words(summand)
                 if words & (NEAR_WORDS | WANTED_WORDS):
                     yield PaidDistance(WrongSign.NEARNESS_COSTS, summand, summand.place)
-            if summand.weight > 0 and self._is_distance_to_goal(summand.place) and not self._is_of_progress(summand):
+            if summand.weight > 0 and self._is_distance_to_goal(summand.place) and not self.is_of_progress(summand):
                 yield PaidDistance(WrongSign.DISTANCE_PAYS, summand, summand.place)
         for summand in self.reward.differences:
             if not self._is_avoided(summand) and self._pays_leaving(summand):
@@ -121,7 +121,7 @@ class GoalReader:
                 return self.errors.is_wanted(inner.at(left)) != self.errors.is_wanted(inner.at(right))
         return False
 
-    def _is_of_progress(self, summand: Summand) -> bool:
+    def is_of_progress(self, summand: Summand) -> bool:
         """Say whether another summand takes away what this one was a step before."""
         if any(summand.place.node in list(ast.walk(one.place.node)) for one in self.reward.differences):
             return True

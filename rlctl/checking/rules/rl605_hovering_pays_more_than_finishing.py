@@ -1,5 +1,6 @@
 """RL605: hovering pays more than finishing."""
 
+import ast
 import dataclasses
 from collections.abc import Iterator, Sequence
 
@@ -14,6 +15,7 @@ from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
 from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.paid_successes import SuccessReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 
@@ -265,6 +267,13 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message = f"success replaces the reward by {number:.4g}, and a step next to the goal pays up to {income:.4g}"
         evidence = {"value": number, "expected": f"above {income:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
+        return
+    low = SuccessReader(reader).find()
+    if low is not None:
+        message = f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
+        message += f" {low.before:.4g}" + (f", where only {low.lacks} is not true" if low.lacks else "")
+        evidence = {"value": low.success, "expected": f"above {low.before:.4g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(low.paid))
         return
     income, bonus = reader.read_income(), reader.read_bonus()
     if bonus is not None and income > 0 and reader.ends_at_success():

@@ -13,6 +13,7 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.leaving import Leaving, find_leaving
+from rlctl.checking.paid_distances import RiseReader
 from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.reward_peaks import Peak, find_peaks
@@ -365,8 +366,16 @@ def _exceeds(rewards: Sequence[float], inside: _Outcome) -> bool:
 @judges_expressions(RULE, decides=False)
 def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first summand of the reward whose sign pays for a distance."""
-    for paid in GoalReader(notes).find_wrong_signs():
+    reader = GoalReader(notes)
+    for paid in reader.find_wrong_signs():
         text, weight = ast.unparse(paid.place.node), paid.summand.weight
         message = f"{paid.how} in the source of the reward: {text} counts {weight:+.4g} times"
         yield RuleFinding(RULE, message, {"element": paid.summand.name}, where=notes.reward.locate(paid.place))
+        return
+    for rise in RiseReader(reader).find_rises():
+        (close, near), (away, far) = rise.near, rise.far
+        message = f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"
+        message += f" the same steps pay {near:.4g} where it is {close:.3g}, and {far:.4g} where it is {away:.3g}"
+        evidence = {"element": rise.name, "value": far, "expected": f"below {near:.6g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(rise.place))
         return

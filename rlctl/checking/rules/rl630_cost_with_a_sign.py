@@ -13,6 +13,7 @@ from rlctl.checking.paid_errors import ErrorReader
 from rlctl.checking.records import CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rewards import RAW_TERMS, TERMS, WITH_SEARCH, find_terms, has_terms, require_rewarded
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.signed_costs import SignedCostReader
 from rlctl.checking.term_names import is_about_actions, is_cost, is_error, split_name
 from rlctl.checking.term_weights import list_methods
 from rlctl.checking.transitions import find_float_leaves
@@ -201,4 +202,11 @@ def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message += f" signs: it costs up to {-paid.min():.4g} and pays up to {paid.max():.4g}"
         evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(place))
+        return
+    for summand, place in SignedCostReader(notes).find():
+        paid = summand.weight * notes.reward.list_values(summand.place.node)
+        message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} has a sign: it costs up to"
+        message += f" {-paid.min():.4g} and pays up to {paid.max():.4g}"
+        evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
         return

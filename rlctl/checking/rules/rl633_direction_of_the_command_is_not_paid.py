@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rlctl.checking.command_sizes import SizeReader
 from rlctl.checking.drawn_goals import DrawnPlace, Numbers
 from rlctl.checking.experiments.commands import LATER_STEPS, CommandTrials, judges_commands
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -107,4 +108,9 @@ def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message = f"reward term {summand.name!r} compares lengths only, and nothing compares the direction:"
         message += f" {ast.unparse(place.node)}"
         yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(place))
+        return
+    for one in SizeReader(notes).find_one_sided():
+        message = f"reward term {one.summand.name!r} compares a command that has both signs with {ast.unparse(one.size)},"
+        message += f" which is never negative: {ast.unparse(one.place.node)}"
+        yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
         return
