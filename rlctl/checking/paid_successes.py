@@ -43,8 +43,12 @@ class SuccessReader:
         number = self._find_number(place) if place is not None else None
         if place is None or number is None or not self._decides(place):
             return None
-        found = [self._compare(episode, place) for episode in EPISODES]
-        return found[0] if all(found) else None
+        found: LowSuccess | None = None
+        for episode in EPISODES:
+            found = self._compare(episode, place)
+            if found is None:
+                break
+        return found
 
     def _decides(self, place: ReadExpression) -> bool:
         """Say whether a summand of the reward depends on success."""

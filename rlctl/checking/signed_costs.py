@@ -93,7 +93,8 @@ class SignedCostReader:
     def _is_one(self, hops: list[ReadExpression]) -> bool:
         """Say whether it is one number, and neither a product, nor a sum, nor a change."""
         last = hops[-1]
-        if any(self.errors.is_between_steps(hop) for hop in hops):
+        differences = [hop for hop in hops if isinstance(hop.node, ast.BinOp) and isinstance(hop.node.op, ast.Sub)]
+        if any(map(self.errors.is_between_steps, differences)):
             return False
         match last.node:
             case ast.Call(func=function):

@@ -259,7 +259,7 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         yield RuleFinding(RULE, message, finished.at(best.step, **earned))
 
 
-@judges_expressions(RULE, decides=False)
+@judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
 def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Read what the source pays for success, and what it pays in each step next to the goal."""
     reader = GoalReader(notes)

@@ -363,7 +363,7 @@ def _exceeds(rewards: Sequence[float], inside: _Outcome) -> bool:
     return not inside.has_ended and min(rewards) > inside.reward + least
 
 
-@judges_expressions(RULE, decides=False)
+@judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
 def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first summand of the reward whose sign pays for a distance."""
     reader = GoalReader(notes)
