@@ -3,8 +3,8 @@
 import ast
 from collections.abc import Iterator, Sequence
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.summands import read_name
 from rlctl.checking.term_names import split_name
 
 LINEAR, ANGULAR = (

@@ -274,8 +274,11 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 
 
 def _findings(rule: str, records: Records) -> list[RuleFinding]:
-    """Return the findings of a rule; those by expressions of the source only where it has found nothing else."""
-    of_source: list[RuleFinding] = [one for one in records.facts.get(BY_EXPRESSIONS, ()) if one.rule == rule]
+    """Return the findings of a rule; those by expressions of the source only where it has found nothing else, and
+    experiments nothing for the rules that find the same."""
+    found: set[str] = {finding.rule for finding in records.findings}
+    by_expressions: list[RuleFinding] = records.facts.get(BY_EXPRESSIONS, [])
+    of_source = [one for one in by_expressions if one.rule == rule and not found & set(one.same)]
     try:
         return _find_played(rule, records) or of_source
     except (NotJudged, NotApplicable):

@@ -2,11 +2,12 @@
 
 import ast
 import collections
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
-from rlctl.checking.assignments import Assignments
-from rlctl.checking.expressions import Function, NotedCall, SourceCode
-from rlctl.checking.source_mistakes import SourceMistake
+from rlctl.checking.assignments import CONVERSIONS
+from rlctl.checking.definitions import Definitions
+from rlctl.checking.expressions import NotedCall, SourceCode
+from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.term_names import split_name
 
 KINDS = {"geom": "geom", "body": "body", "joint": "joint", "jnt": "joint", "site": "site", "actuator": "actuator"}
@@ -20,8 +21,8 @@ DEEPEST = 6  # assignments that are followed
 class Ids:
     """Of which kind the ids are that expressions hold: those of geoms, bodies, joints, sites, actuators, or links."""
 
-    def __init__(self, assignments: Assignments) -> None:
-        self._assignments = assignments
+    def __init__(self, definitions: Definitions) -> None:
+        self._definitions = definitions
 
     def find(self, node: ast.expr, depth: int = 0) -> set[str]:
         """Return the kinds of an expression, or of what it holds; empty for what is not known."""
@@ -48,13 +49,13 @@ class Ids:
             case ast.ListComp(elt=part) | ast.SetComp(elt=part) | ast.GeneratorExp(elt=part):
                 return self.find(part, depth + 1)
             case ast.Call(func=function, args=[part, *_]) if ast.unparse(function).rsplit(".", 1)[-1] in (
-                *("set", "list", "tuple", "sorted", "array", "asarray", "frozenset", "int"),
+                *("set", "list", "tuple", "sorted", "frozenset", "int", *CONVERSIONS),
             ):
                 return self.find(part, depth + 1)
             case ast.Name() | ast.Attribute():
-                return self._unite(self._assignments.read(node), depth)
-            case ast.Call(func=function):
-                return self._unite(self._assignments.list_returned(function), depth)
+                return self._unite(self._definitions.read(node), depth)
+            case ast.Call():
+                return self._unite(self._definitions.read_returned(node), depth)
         return set()
 
     def _unite(self, values: Sequence[ast.expr], depth: int) -> set[str]:
@@ -63,7 +64,7 @@ class Ids:
 
     def is_point(self, node: ast.expr) -> bool:
         """Say whether a name goes through the contact points of PyBullet."""
-        values = self._assignments.read(node) if isinstance(node, ast.Name) else ()
+        values = self._definitions.read(node) if isinstance(node, ast.Name) else ()
         return bool(values) and all(self._lists_points(value) for value in values)
 
     def _lists_points(self, node: ast.expr, depth: int = 0) -> bool:
@@ -73,7 +74,7 @@ class Ids:
             case ast.BoolOp(values=[first, *_]):
                 return self._lists_points(first, depth)
             case ast.Name() | ast.Attribute() if depth < DEEPEST:
-                values = self._assignments.read(node)
+                values = self._definitions.read(node)
                 return bool(values) and all(self._lists_points(value, depth + 1) for value in values)
         return False
 
@@ -82,10 +83,12 @@ class Ids:
         return bool({"contact", "contacts", "con", "c"} & set(split_name(ast.unparse(node).rsplit(".", 1)[-1])))
 
 
-def find_wrong_ids(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) -> Iterator[SourceMistake]:
+def find_wrong_ids(
+    rule: Rule, definitions: Definitions, episodes: Sequence[Sequence[NotedCall]]
+) -> Iterator[RuleFinding]:
     """Yield comparisons of the ids of contacts with those of another kind, and of a distance that is never so large."""
-    ids = Ids(Assignments(source))
-    for one in source.expressions:
+    ids = Ids(definitions)
+    for one in definitions.source.expressions:
         if not isinstance(one.node, ast.Compare):
             continue
         left, right = one.node.left, one.node.comparators[0]
@@ -101,7 +104,7 @@ def find_wrong_ids(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) 
                         f"{one.text} compares the id of a contact's {min(theirs)} with {ast.unparse(other)}, which is"
                     )
                     message += f" that of a {wrong[0]}: ids of different kinds have nothing to do with each other"
-                    yield SourceMistake("RL834", message, {"element": one.text, "value": wrong}, one.where)
+                    yield RuleFinding(rule, message, {"element": one.text, "value": wrong}, where=one.where)
         match left, one.node.ops[0]:
             case ast.Subscript(value=owner, slice=ast.Constant(value=8)), ast.Gt() | ast.GtE() if ids.is_point(owner):
                 if len(values) >= FEWEST and not any(values):
@@ -109,18 +112,18 @@ def find_wrong_ids(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) 
                     message += (
                         " contact point is the distance, and below 0 where bodies touch; the normal force is field 9"
                     )
-                    yield SourceMistake("RL834", message, {"element": one.text, "value": len(values)}, one.where)
+                    yield RuleFinding(rule, message, {"element": one.text, "value": len(values)}, where=one.where)
 
 
 def _open_literal(node: ast.expr) -> list[ast.expr]:
     return node.elts if isinstance(node, ast.Set | ast.Tuple | ast.List) else [node]
 
 
-def find_doubled_ids(source: SourceCode, evaluated: set[Function]) -> Iterator[SourceMistake]:
+def find_doubled_ids(rule: Rule, source: SourceCode, evaluated: Collection[ast.AST]) -> Iterator[RuleFinding]:
     """Yield lists in which one part is looked up twice by its name, in classes whose functions were evaluated."""
     for file, tree in source.trees.items():
         classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-        own = [one for one in classes if one.name in source.classes or evaluated & set(one.body)]
+        own = [one for one in classes if one.name in source.classes or any(node in evaluated for node in one.body)]
         for node in (node for one in own for node in ast.walk(one)):
             if not isinstance(node, ast.List | ast.Tuple) or len(node.elts) < 2:
                 continue
@@ -128,7 +131,7 @@ def find_doubled_ids(source: SourceCode, evaluated: set[Function]) -> Iterator[S
             doubled = [text for text, count in collections.Counter(texts).items() if count > 1]
             if doubled and len(texts) == len(node.elts):
                 message = f"{ast.unparse(node)} looks up {doubled[0]} twice: another part of the list is left out"
-                yield SourceMistake("RL835", message, {"element": doubled[0]}, (file, node.lineno))
+                yield RuleFinding(rule, message, {"element": doubled[0]}, where=(file, node.lineno))
 
 
 def _is_lookup(node: ast.expr) -> bool:

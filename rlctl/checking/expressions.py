@@ -73,7 +73,7 @@ class SourceCode:
         self._numbers = {one.node: one.number for one in self.expressions}
 
     def _number(self, file: str, function: Function) -> None:
-        for node in _walk_own(function):
+        for node in walk_own(function):
             if isinstance(node, ast.expr) and _is_noted(node):
                 node.noted = len(self.expressions)  # type: ignore[attr-defined]  # copies of the node keep it
                 self.expressions.append(Expression(len(self.expressions), node, file, function))
@@ -238,7 +238,7 @@ def _list_codes(code: CodeType) -> Iterator[CodeType]:
             yield from _list_codes(constant)
 
 
-def _walk_own(function: Function) -> Iterator[ast.AST]:
+def walk_own(function: Function) -> Iterator[ast.AST]:
     """Yield the nodes of a function's statements, without those of functions and classes in it."""
     waiting: list[ast.AST] = [*reversed(function.body)]
     while waiting:

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.data_flow import DataFlow, read_key
+from rlctl.checking.assignments import read_key
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Expression, NotedCall
 
@@ -28,8 +29,8 @@ class EndlessLanding:
 
 def find_endless_landings(noted: NotedEpisodes) -> Iterator[EndlessLanding]:
     """Yield conditions `contact and time > 0` that hold in each step of contact."""
-    flow = DataFlow(noted.source, noted.is_used)
-    for contact, comparison, time, key in _list_conditions(noted, flow):
+    definitions = noted.definitions
+    for contact, comparison, time, key in _list_conditions(noted, definitions):
         stays: list[float] = []
         for episode in noted.episodes:
             touching, times = _read(contact, time, episode[1:])
@@ -42,18 +43,20 @@ def find_endless_landings(noted: NotedEpisodes) -> Iterator[EndlessLanding]:
             yield EndlessLanding(key, comparison.text, comparison.where, float(values[0]), len(values))
 
 
-def _list_conditions(noted: NotedEpisodes, flow: DataFlow) -> Iterator[tuple[Expression, Expression, Expression, str]]:
+def _list_conditions(
+    noted: NotedEpisodes, definitions: Definitions
+) -> Iterator[tuple[Expression, Expression, Expression, str]]:
     """Yield a contact, the comparison of a time that has to hold besides, the time, and its attribute."""
     source = noted.source
     for comparison in source.expressions:
         time = _read_time(comparison.node)
         if time is None or (noted_time := source.find(time)) is None:
             continue
-        origin, _ = flow.resolve(time, comparison.function)
+        origin = definitions.find_origin(time, comparison.function)
         key = read_key(origin)
-        if not key or not _is_timer(flow, key):
+        if not key or not _is_timer(definitions, key):
             continue
-        for other in _list_others(flow, comparison.node):
+        for other in _list_others(definitions, comparison.node):
             if (contact := source.find(other)) is not None:
                 yield contact, comparison, noted_time, key
 
@@ -68,14 +71,14 @@ def _read_time(node: ast.expr) -> ast.expr | None:
     return None
 
 
-def _is_timer(flow: DataFlow, key: str) -> bool:
+def _is_timer(definitions: Definitions, key: str) -> bool:
     """Say whether an attribute is counted up, and is set to 0 other than in the functions that begin an episode."""
-    counts = [one for one in flow.assigned[key] if _counts_up(flow, key, one.statement)]
-    zeroes = [one for one in flow.assigned[key] if _sets_back(one.statement, one.value)]
+    counts = [one for one in definitions.assigned[key] if _counts_up(key, one.statement)]
+    zeroes = [one for one in definitions.assigned[key] if _sets_back(one.statement, one.value)]
     return bool(counts and zeroes)
 
 
-def _counts_up(flow: DataFlow, key: str, statement: ast.stmt) -> bool:
+def _counts_up(key: str, statement: ast.stmt) -> bool:
     if isinstance(statement, ast.AugAssign):
         return isinstance(statement.op, ast.Add)
     sums = [node for node in ast.walk(statement) if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add)]
@@ -90,16 +93,16 @@ def _sets_back(statement: ast.stmt, value: ast.expr) -> bool:
     return is_product or any(isinstance(node, ast.Constant) and node.value in (0, 0.0) for node in nodes)
 
 
-def _list_others(flow: DataFlow, comparison: ast.expr) -> Iterator[ast.expr]:
+def _list_others(definitions: Definitions, comparison: ast.expr) -> Iterator[ast.expr]:
     """Yield what has to hold together with a comparison."""
-    parents = flow.source.parents
+    parents = definitions.source.parents
     node: ast.AST = comparison
     parent = parents[node]
     match parent:
         case ast.Assign(targets=[ast.Name(id=name)]):
-            for use in ast.walk(flow.source.find_function(parent)):
+            for use in ast.walk(definitions.source.find_function(parent)):
                 if isinstance(use, ast.Name) and use.id == name and isinstance(use.ctx, ast.Load):
-                    yield from _list_others(flow, use)
+                    yield from _list_others(definitions, use)
         case ast.BinOp(left=left, op=ast.BitAnd() | ast.Mult(), right=right):
             yield right if left is node else left
         case ast.BoolOp(op=ast.And(), values=values):

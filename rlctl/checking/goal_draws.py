@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.data_flow import Assignment, peel
+from rlctl.checking.assignments import Assignment, peel
 from rlctl.checking.expressions import Expression, Function, NotedCall, Value
 from rlctl.checking.previous_values import KeptDifference, KeptDifferences, is_goal, is_previous_key
 from rlctl.checking.timed_expressions import spans_steps
@@ -46,7 +46,7 @@ class GoalDraws:
     """The branches that go on to new goals."""
 
     def __init__(self, kept: KeptDifferences) -> None:
-        self.kept, self.flow, self.noted = kept, kept.flow, kept.noted
+        self.kept, self.definitions, self.noted = kept, kept.definitions, kept.noted
 
     def find_jumps(self) -> Iterator[GoalJump]:
         """Yield differences that jump in the step after a new goal, and are paid."""
@@ -62,8 +62,8 @@ class GoalDraws:
 
     def list_branches(self, one: KeptDifference) -> list[Branch]:
         """Return the branches in which a step sets a goal that a difference depends on."""
-        keys = sorted(self.flow.list_reads(one.new.node, one.whole.function) & self.flow.assigned.keys())
-        goals = [(key, assignment) for key in keys for assignment in self.flow.assigned[key]]
+        keys = sorted(self.definitions.list_reads(one.new.node, one.whole.function) & self.definitions.assigned.keys())
+        goals = [(key, assignment) for key in keys for assignment in self.definitions.assigned[key]]
         goals = [(key, assignment) for key, assignment in goals if self.is_new_goal(key, assignment)]
         if any(self._adds_up(one, key) for key in {key for key, _ in goals}):
             return []
@@ -77,7 +77,7 @@ class GoalDraws:
 
     def _adds_up(self, one: KeptDifference, key: str) -> bool:
         """Say whether the new value has the rest of the way behind the next goal: it then goes on without a jump."""
-        for top, function in self.flow.list_sources(one.new.node, one.whole.function):
+        for top, function in self.definitions.list_sources(one.new.node, one.whole.function):
             for node in ast.walk(top):
                 match node:
                     case ast.For(iter=steps) | ast.comprehension(iter=steps):
@@ -100,9 +100,9 @@ class GoalDraws:
         return False
 
     def _reads_plainly(self, node: ast.expr, function: Function, key: str) -> bool:
-        if key not in self.flow.list_reads(node, function):
+        if key not in self.definitions.list_reads(node, function):
             return False
-        sources = [top for top, _ in self.flow.list_sources(node, function)]
+        sources = [top for top, _ in self.definitions.list_sources(node, function)]
         return not any(isinstance(inner, ast.Sub) for top in sources for inner in ast.walk(top))
 
     def _takes_next(self, assignment: Assignment) -> bool:
@@ -111,12 +111,12 @@ class GoalDraws:
             case ast.Call(func=ast.Attribute(attr="pop" | "popleft") | ast.Name(id="next")):
                 return True
             case ast.Subscript(slice=index):
-                keys = self.flow.list_reads(index, assignment.function)
-                return any(_counts(one) for key in keys for one in self.flow.assigned.get(key, ()))
+                keys = self.definitions.list_reads(index, assignment.function)
+                return any(_counts(one) for key in keys for one in self.definitions.assigned.get(key, ()))
         return False
 
     def _draws(self, assignment: Assignment) -> bool:
-        tops = [top for top, _ in self.flow.list_sources(assignment.value, assignment.function)]
+        tops = [top for top, _ in self.definitions.list_sources(assignment.value, assignment.function)]
         calls = [node for top in tops for node in ast.walk(top) if isinstance(node, ast.Call)]
         return any(isinstance(call.func, ast.Attribute) and call.func.attr in DRAWS for call in calls)
 
@@ -151,8 +151,8 @@ class GoalDraws:
         """Yield the conditions of a node from the innermost to the outermost, by each way that leads to it."""
         if function.name in OUTER:
             return
-        inner = self.flow.list_conditions(node)
-        calls = self.flow.calls[function.name]
+        inner = self.definitions.list_conditions(node)
+        calls = self.definitions.calls[function.name]
         if not calls or function.name == "step":
             yield inner
         for call, caller in calls if depth else ():
@@ -192,9 +192,9 @@ class GoalDraws:
     def _list_masks(self, test: Expression) -> Iterator[tuple[int, Any]]:
         for node in ast.walk(test.node):
             if isinstance(node, ast.Name):
-                origin, _ = self.flow.resolve(node, test.function)
+                origin = self.definitions.find_origin(node, test.function)
                 if isinstance(origin, ast.Call) and origin.args:  # np.flatnonzero(mask)
-                    origin, _ = self.flow.resolve(peel(origin.args[0]), test.function)
+                    origin = self.definitions.find_origin(peel(origin.args[0]), test.function)
                 mask = self.noted.source.find(origin)
                 if mask is None:
                     continue

@@ -8,33 +8,22 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.assignments import Assignments
+from rlctl.checking.assignments import CONVERSIONS
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.expressions import Function
-from rlctl.checking.source_mistakes import FRAME_RULES, SourceMistake
+from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turned_expressions import VectorTurn
 from rlctl.checking.vector_series import VectorSeries, list_words
 from rlctl.checking.world_vectors import WorldVectors
-from rlctl.checking.wrong_turns import TurnedVectors
+from rlctl.checking.wrong_turns import FRAME_RULES, TurnedVectors
 
 Array = NDArray[np.float64]
 
 OBSERVERS = {"observe", "_observe"}  # of tasks, which have no step of their own
 PASSED_ON = {
-    *(
-        "concatenate",
-        "array",
-        "asarray",
-        "stack",
-        "hstack",
-        "vstack",
-        "column_stack",
-        "clip",
-        "astype",
-        "copy",
-        "ravel",
-    ),
-    *("reshape", "flatten", "append", "nan_to_num", "list", "tuple", "dict", "items", "values", "float32", "float"),
-}
+    "append", "clip", "column_stack", "concatenate", "dict", "hstack", "items", "list", "reshape", "stack", "tuple",
+    "values", "vstack", *CONVERSIONS,
+}  # fmt: skip
 SEEN_WORDS = {"ray", "rays", "scan", "scans", "lidar", "camera", "image", "pixels", "ranges", "sonar"}
 DEEPEST = 14
 SAME, MOSTLY = 1e-6, 0.9
@@ -44,9 +33,8 @@ WIDE = 2.0  # range of the headings in which episodes begin [rad]
 class ObservedCode:
     """The pieces of code of which an observation is made."""
 
-    def __init__(self, series: VectorSeries, turns: list[VectorTurn]) -> None:
-        self._series = series
-        self._assignments = Assignments(series.source)
+    def __init__(self, series: VectorSeries, definitions: Definitions, turns: list[VectorTurn]) -> None:
+        self._series, self._definitions = series, definitions
         self._turned = {turn.whole.node for turn in turns}
 
     @functools.cached_property
@@ -74,7 +62,7 @@ class ObservedCode:
         """Say whether a name has what PyBullet returns as a velocity of a base, in the world's frame."""
         while isinstance(node, ast.Call) and ast.unparse(node.func).rsplit(".", 1)[-1] in PASSED_ON and node.args:
             node = node.args[0]
-        values = self._assignments.read_parts(node) if isinstance(node, ast.Name) else ()
+        values = self._definitions.read_parts(node) if isinstance(node, ast.Name) else ()
         return any("getBaseVelocity(" in ast.unparse(value) for value in values)
 
     def _visit(self, node: ast.expr, found: dict[ast.expr, None], depth: int) -> None:
@@ -105,14 +93,14 @@ class ObservedCode:
             case ast.IfExp(body=body, orelse=other):
                 return [body, other]
             case ast.Name():
-                return [*self._assignments.read(node), *self._assignments.read_parts(node)]
+                return [*self._definitions.read(node), *self._definitions.read_parts(node)]
             case ast.Call(func=function, args=args, keywords=keywords):
                 name = ast.unparse(function).rsplit(".", 1)[-1]
                 owner = [function.value] if isinstance(function, ast.Attribute) else []
                 given = [*args, *(keyword.value for keyword in keywords)]
                 if name in PASSED_ON:
                     return [*owner, *given]
-                return [*self._assignments.list_returned(function), *(one for one in given if self._is_like(node, one))]
+                return [*self._definitions.read_returned(node), *(one for one in given if self._is_like(node, one))]
         return []
 
     def _is_like(self, whole: ast.expr, part: ast.expr) -> bool:
@@ -121,11 +109,11 @@ class ObservedCode:
         return any(one is not None and other is not None for one, other in zip(sizes[:2], sizes[2:], strict=True))
 
 
-def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
+def find_world_vectors(rule: Rule, turned: TurnedVectors, definitions: Definitions) -> Iterator[RuleFinding]:
     """Yield the first vector of the world in an observation that has others in the frame of the robot, and does not
     show its heading, with which episodes begin in all directions."""
     series, turns, directions, world = turned.series, turned.turns, turned.directions, turned.world
-    observed = ObservedCode(series, turns)
+    observed = ObservedCode(series, definitions, turns)
     if any(SEEN_WORDS & list_words(node) for node in observed.nodes):
         return
     inside = [entry for entry in turned.known if entry[0].whole.node in set(observed.nodes)]
@@ -150,7 +138,8 @@ def find_world_vectors(turned: TurnedVectors) -> Iterator[SourceMistake]:
                     f"{one.text}, {what}, is observed in the axes of the world, and {turn.whole.text} in the frame"
                 )
                 message += f" of the robot: nothing shows the heading, which is another one in each episode ({by})"
-                yield SourceMistake("RL129", message, {"element": one.text, "value": by}, one.where, FRAME_RULES)
+                evidence = {"element": one.text, "value": by}
+                yield RuleFinding(rule, message, evidence, where=one.where, same=FRAME_RULES)
                 return
 
 

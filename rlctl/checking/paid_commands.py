@@ -6,10 +6,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import COMMAND_WORDS, WANTED_WORDS, ErrorReader, has_both_signs
-from rlctl.checking.summands import Summand, read_name
+from rlctl.checking.summands import Summand
 from rlctl.checking.term_names import split_name
 
 ANGULAR_WORDS = {"ang", "angular", "angvel", "gyro", "gyroscope", "omega", "rates"}
@@ -144,7 +145,7 @@ class CommandReader:
                             continue
                         texts = [one for one in vectors if one is not None]
                         commands = [one for one in texts if self._has_command(one)]
-                        values = [self.notes.reward.list_values(one.node) for one in texts]
+                        values = [self.notes.reward.numbers.list_values(one.node) for one in texts]
                         is_turned = all(has_both_signs(numbers, 0.03) for numbers in values)
                         if len(commands) == 1 and is_turned and not self._is_compared(commands[0]):
                             yield summand, place

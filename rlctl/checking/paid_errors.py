@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.summands import SUMS, RewardReader, Summand, list_product, read_name
+from rlctl.checking.summands import SUMS, RewardReader, Summand, list_product
 from rlctl.checking.term_names import ENERGY_WORDS, OPPOSITE_WORDS, PLACE_WORDS, split_name
 from rlctl.checking.timed_expressions import spans_steps
 
@@ -83,7 +84,7 @@ class ErrorReader:
             inner = read_summed(place.node)
             if inner is None or self._is_product(place.at(inner), summand.name):
                 continue
-            sums = self.reward.list_values(place.node)
+            sums = self.reward.numbers.list_values(place.node)
             if sums.size >= FEWEST and has_both_signs(sums, CLEAR):
                 yield summand, place
 
@@ -103,7 +104,7 @@ class ErrorReader:
                 place = self.definitions.resolve(summand.place.at(factor))
                 match place.node:
                     case ast.BinOp(left=base, op=ast.Pow(), right=ast.Constant(value=int(power))) if power % 2 == 0:
-                        values = self.reward.list_values(base)
+                        values = self.reward.numbers.list_values(base)
                         if values.size < FEWEST or np.abs(values).max() > 1 + 1e-6 or not (values < 0).mean() > PART:
                             continue
                         if self._is_cosine(place.at(base)) and ast.unparse(base) in self._directed:
@@ -128,7 +129,7 @@ class ErrorReader:
             place = self.definitions.resolve(summand.place.at(factor))
             match place.node:
                 case ast.Call(func=function, args=[only]) if read_name(function) == "exp" and not summand.weight < 0:
-                    values = self.reward.list_values(place.node)
+                    values = self.reward.numbers.list_values(place.node)
                     if values.size and (values > 1.05).mean() > PART:
                         yield "exp", place.at(only), 1.0
                 case ast.Call(func=function, args=[only]) if read_name(function) == "tanh" and summand.weight < 0:
@@ -169,9 +170,9 @@ class ErrorReader:
                     yield from self._list_linear(found[0], sign, texts)
 
     def _is_fixed(self, place: ReadExpression) -> bool:
-        if self.reward.read_constant(place.node) is not None:
+        if self.reward.numbers.read_constant(place.node) is not None:
             return True
-        values = self.reward.list_values(place.node)
+        values = self.reward.numbers.list_values(place.node)
         return bool(values.size) and bool((values == values[0]).all())
 
     def _is_signed_error(self, place: ReadExpression, texts: Sequence[str], summand: Summand, needs_both: bool) -> bool:
@@ -185,7 +186,7 @@ class ErrorReader:
             return False
         if all(self._is_fixed(side) for side in sides):
             return False
-        values = self.reward.list_values(place.node)
+        values = self.reward.numbers.list_values(place.node)
         has_both = values.size >= FEWEST and has_both_signs(values, PART)
         is_sized = any(text in self._sized for text in [*texts, ast.unparse(place.node)])
         reverse = f"{ast.unparse(place.node.right)} - {ast.unparse(place.node.left)}"

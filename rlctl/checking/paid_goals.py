@@ -7,10 +7,11 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed
-from rlctl.checking.summands import SUMS, Summand, read_name
+from rlctl.checking.summands import SUMS, Summand
 from rlctl.checking.term_names import is_about_time, split_name
 
 AVOIDED_WORDS = {
@@ -94,11 +95,11 @@ class GoalReader:
         resolved = self.definitions.resolve(place)
         match resolved.node:
             case ast.BinOp(left=left, op=ast.Mult(), right=right):
-                constants = [self.reward.read_constant(side) for side in (left, right)]
+                constants = [self.reward.numbers.read_constant(side) for side in (left, right)]
                 others = [side for side, number in zip((left, right), constants, strict=True) if number is None]
                 return len(others) == 1 and self._is_nearness(resolved.at(others[0]))
             case ast.Call(func=function, args=[argument, *_]) if read_name(function) in KERNELS:
-                values = self.reward.list_values(resolved.node)
+                values = self.reward.numbers.list_values(resolved.node)
                 is_kernel = values.size >= FEWEST and values.min() >= 0 and values.max() <= 1 + 1e-9
                 return is_kernel and any(map(self._is_distance, self.definitions.walk(resolved.at(argument))))
             case ast.Call(func=function) if read_name(function) in SUMS:
@@ -144,7 +145,7 @@ class GoalReader:
         new, sign = (left, 1.0) if earlier[1] else (right, -1.0)
         if summand.weight * sign <= 0:
             return False
-        values = self.reward.list_values(new)
+        values = self.reward.numbers.list_values(new)
         return values.size >= FEWEST and values.min() >= 0 and self._is_distance(summand.place.at(new))
 
     def _is_distance(self, place: ReadExpression) -> bool:
@@ -248,10 +249,10 @@ class GoalReader:
     def _read_at_goal(self, summand: Summand) -> float:
         """Return what a summand is worth at the goal: the most for a cost, and the least otherwise."""
         resolved = self.definitions.resolve(summand.place)
-        number = self.reward.read_constant(resolved.node)
+        number = self.reward.numbers.read_constant(resolved.node)
         if number is not None:
             return number
-        values = self.reward.list_values(resolved.node)
+        values = self.reward.numbers.list_values(resolved.node)
         is_kernel = isinstance(resolved.node, ast.Call) and read_name(resolved.node.func) in KERNELS - {"arrival"}
         if is_kernel and values.size and values.max() <= 1 + 1e-9:
             return 1.0
@@ -267,7 +268,7 @@ class GoalReader:
     def pays_for_time(self) -> bool:
         """Say whether a constant that is called after time is added in each step."""
         return any(
-            one.weight * (self.reward.read_constant(one.place.node) or 0.0) > 0
+            one.weight * (self.reward.numbers.read_constant(one.place.node) or 0.0) > 0
             for one in self.reward.summands
             if is_about_time(one.name) and not one.conditions
         )
@@ -277,7 +278,7 @@ class GoalReader:
         paid = [one for one in self.reward.summands if self._is_of_success(one)]
         total = 0.0
         for one in paid:
-            number = self.reward.read_constant(one.place.node)
+            number = self.reward.numbers.read_constant(one.place.node)
             number = 1.0 if number is None and self.is_success(one.place.node, one.place) else number
             if number is None or math.isnan(one.weight):
                 return None
@@ -293,6 +294,6 @@ class GoalReader:
         """Yield numbers that replace the reward on success, with what they are, if steps before it may pay more."""
         income = self.read_income()
         for one in self.reward.summands:
-            number = self.reward.read_constant(one.place.node)
+            number = self.reward.numbers.read_constant(one.place.node)
             if one.replaces and number is not None and self._is_of_success(one) and one.weight * number < income:
                 yield one, one.weight * number, income

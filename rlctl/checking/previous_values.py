@@ -2,14 +2,13 @@
 
 import ast
 import dataclasses
-import functools
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rlctl.checking.data_flow import Assignment, DataFlow, read_key, read_words
+from rlctl.checking.assignments import Assignment, read_key, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Expression, NotedCall, Value
 from rlctl.checking.term_names import ERROR_WORDS, is_place, split_name
@@ -60,17 +59,17 @@ class KeptDifferences:
     """Those of a source, and the judgements of them."""
 
     def __init__(self, noted: NotedEpisodes) -> None:
-        self.noted, self.flow = noted, DataFlow(noted.source, noted.is_used)
+        self.noted, self.definitions = noted, noted.definitions
         self.differences = [one for expression in noted.source.expressions for one in self._read(expression)]
 
     def _read(self, whole: Expression) -> Iterator[KeptDifference]:
         sides = _read_sides(whole.node)
         for one, other in (sides, sides[::-1]) if sides else ():
             kept, new = self.noted.source.find(one), self.noted.source.find(other)
-            origin, _ = self.flow.resolve(one, whole.function)
-            if kept is None or new is None or not (key := read_key(origin)) or key not in self.flow.assigned:
+            origin = self.definitions.find_origin(one, whole.function)
+            if kept is None or new is None or not (key := read_key(origin)) or key not in self.definitions.assigned:
                 continue
-            new_origin, _ = self.flow.resolve(other, whole.function)
+            new_origin = self.definitions.find_origin(other, whole.function)
             if ast.unparse(new_origin) != ast.unparse(origin):
                 yield KeptDifference(whole, kept, new, key, new_origin)
 
@@ -89,9 +88,9 @@ class KeptDifferences:
 
     def _is_copied(self, one: KeptDifference) -> bool:
         """Say whether a step replaces what is kept by a copy of the new value."""
-        for assignment in self.flow.assigned[one.key]:
-            origin, _ = self.flow.resolve(assignment.value, assignment.function)
-            if assignment.function in self.of_steps and ast.unparse(origin) == ast.unparse(one.origin):
+        for assignment in self.definitions.assigned[one.key]:
+            origin = self.definitions.find_origin(assignment.value, assignment.function)
+            if assignment.function in self.noted.of_steps and ast.unparse(origin) == ast.unparse(one.origin):
                 return True
         return False
 
@@ -114,26 +113,20 @@ class KeptDifferences:
     def _may_be_replaced(self, one: KeptDifference) -> bool:
         """Say whether code of a step replaces what is kept, other than where a new goal comes."""
         return any(
-            assignment.function in self.of_steps and not self.comes_with_goal(assignment)
-            for assignment in self.flow.assigned[one.key]
+            assignment.function in self.noted.of_steps and not self.comes_with_goal(assignment)
+            for assignment in self.definitions.assigned[one.key]
         )
 
     def comes_with_goal(self, assignment: Assignment) -> bool:
         """Say whether an assignment stands under an `if`, or in a function, that also sets a goal."""
-        conditions = self.flow.list_conditions(assignment.statement)
+        conditions = self.definitions.list_conditions(assignment.statement)
         blocks: list[Sequence[ast.AST]] = [] if conditions else [assignment.function.body]
         for test, is_met in conditions:
             branch = self.noted.source.parents[test]
             assert isinstance(branch, ast.If | ast.IfExp)
             side = branch.body if is_met else branch.orelse
             blocks.append(side if isinstance(side, list) else [side])
-        return any(is_goal(key) for block in blocks for node in block for key in self.flow.list_sets(node))
-
-    @functools.cached_property
-    def of_steps(self) -> set[ast.AST]:
-        """The functions that steps run."""
-        expressions = self.noted.source.expressions
-        return {expressions[number].function for call in self.noted.steps for number in call.values}
+        return any(is_goal(key) for block in blocks for node in block for key in self.definitions.list_sets(node))
 
     def is_paid(self, one: KeptDifference) -> bool:
         """Say whether another difference in one step changes the reward of this step."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rlctl.checking.data_flow import Assignment, read_key, read_words
+from rlctl.checking.assignments import Assignment, read_key, read_words
 from rlctl.checking.expressions import Expression, NotedCall, Value
 from rlctl.checking.goal_draws import BEFORE, Branch, GoalDraws
 from rlctl.checking.previous_values import is_previous_key
@@ -37,19 +37,21 @@ class StaleValues:
     """What no step sets, though it should."""
 
     def __init__(self, draws: GoalDraws) -> None:
-        self.draws, self.flow, self.noted, self.kept = draws, draws.flow, draws.noted, draws.kept
+        self.draws, self.definitions, self.noted, self.kept = draws, draws.definitions, draws.noted, draws.kept
 
     def find_stale_copies(self) -> Iterator[StaleCopy]:
         """Yield copies that no step makes, of goals that steps change: afterwards both are read."""
-        for key, assignments in self.flow.assigned.items():
+        for key, assignments in self.definitions.assigned.items():
             goals = {self._read_copied(one) for one in assignments}
             goal = goals.pop() if len(goals) == 1 else ""
             is_meant = {*read_words(key)} & FIRST_WORDS or is_previous_key(key) or key[-1].isdigit()
-            is_set = any(one.function in self.kept.of_steps for one in assignments)
+            is_set = any(one.function in self.noted.of_steps for one in assignments)
             if not goal or goal == key or is_meant or is_set:
                 continue
-            for one in self.flow.assigned.get(goal, ()):
-                if self.draws.is_new_goal(goal, one) and key not in self.flow.list_reads(one.value, one.function):
+            for one in self.definitions.assigned.get(goal, ()):
+                if self.draws.is_new_goal(goal, one) and key not in self.definitions.list_reads(
+                    one.value, one.function
+                ):
                     for tests in self.draws.list_tests(one):
                         read = self._find_difference(key, goal, Branch(goal, tests))
                         if read is not None:
@@ -57,7 +59,7 @@ class StaleValues:
                             return
 
     def _read_copied(self, assignment: Assignment) -> str:
-        origin, _ = self.flow.resolve(assignment.value, assignment.function)
+        origin = self.definitions.find_origin(assignment.value, assignment.function)
         return read_key(origin) if isinstance(origin, ast.Attribute) else ""
 
     def _find_difference(self, copy: str, goal: str, branch: Branch) -> Expression | None:
@@ -84,11 +86,11 @@ class StaleValues:
     def find_never_set_back(self) -> Iterator[Assignment]:
         """Yield where a time goes on that has to last without a break: no step sets it back where its condition does
         not hold."""
-        for key, assignments in self.flow.assigned.items():
+        for key, assignments in self.definitions.assigned.items():
             words = {*read_words(key)}
             if not words & LASTING_WORDS or words & SUM_WORDS or not self._is_required(key):
                 continue
-            of_steps = [one for one in assignments if one.function in self.kept.of_steps]
+            of_steps = [one for one in assignments if one.function in self.noted.of_steps]
             counting = [one for one in of_steps if self._counts_under_condition(one, key)]
             others = [one for one in of_steps if one not in counting and not self.kept.comes_with_goal(one)]
             if len(counting) == 1 and not others:
@@ -114,11 +116,13 @@ class StaleValues:
                 added = right if read_key(left) == key else left if read_key(right) == key else None
         if added is None:
             return False
-        conditions = self.flow.list_conditions(assignment.statement)
+        conditions = self.definitions.list_conditions(assignment.statement)
         if conditions:
             branch = self.noted.source.parents[conditions[0][0]]
             return isinstance(branch, ast.If) and not branch.orelse
-        origins = [node for top, _ in self.flow.list_sources(added, assignment.function) for node in ast.walk(top)]
+        origins = [
+            node for top, _ in self.definitions.list_sources(added, assignment.function) for node in ast.walk(top)
+        ]
         return any(isinstance(node, ast.Compare | ast.BoolOp | ast.IfExp) for node in origins)
 
 

@@ -6,11 +6,10 @@ import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from rlctl.checking.definitions import CONVERSIONS, DEEPEST, Assigned, Definitions, ReadExpression
-from rlctl.checking.expressions import Function, NotedCall, SourceCode
+from rlctl.checking.assignments import Assignment, read_name
+from rlctl.checking.definitions import DEEPEST, Definitions, ReadExpression
+from rlctl.checking.expressions import Function, NotedCall
+from rlctl.checking.noted_numbers import NotedNumbers
 from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
@@ -38,14 +37,16 @@ class Summand:
 class RewardReader:
     """Reads the summands of the reward."""
 
-    def __init__(self, source: SourceCode, calls: Sequence[NotedCall], weights: Mapping[str, float]) -> None:
-        self.source, self.calls = source, calls
-        self.definitions = Definitions(source, calls)
+    def __init__(self, definitions: Definitions, calls: Sequence[NotedCall], weights: Mapping[str, float]) -> None:
+        self.definitions, self.source = definitions, definitions.source
+        self.numbers = NotedNumbers(definitions, calls)
         self.weights = weights  # of a task's terms
         self._files = {
-            node: file for file, tree in source.trees.items() for node in ast.walk(tree) if isinstance(node, Function)
+            node: file
+            for file, tree in self.source.trees.items()
+            for node in ast.walk(tree)
+            if isinstance(node, Function)
         }
-        self._values: dict[ast.expr, NDArray[np.float64]] = {}
         self._differences: list[Summand] = []
 
     @functools.cached_property
@@ -110,10 +111,12 @@ class RewardReader:
                 yield from go(right, 1.0 if isinstance(operator, ast.Add) else -1.0)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 yield from go(operand, -1.0)
-            case ast.BinOp(left=left, op=ast.Mult(), right=right) if (factor := self.read_constant(left)) is not None:
+            case ast.BinOp(left=left, op=ast.Mult(), right=right) if (
+                factor := self.numbers.read_constant(left)
+            ) is not None:
                 yield from go(right, factor)
             case ast.BinOp(left=left, op=ast.Mult() | ast.Div() as operator, right=right) if (
-                factor := self.read_constant(right)
+                factor := self.numbers.read_constant(right)
             ):
                 yield from go(left, factor if isinstance(operator, ast.Mult) else 1 / factor)
             case ast.IfExp(test=test, body=body, orelse=orelse):
@@ -140,33 +143,25 @@ class RewardReader:
         if not before:
             found = self.definitions.follow(place)
             for one in found:
-                inside = self._list_conditions(one.node, one.function) if one.function is not place.function else ()
-                yield from self._expand(one, weight, own, conditions + inside)
+                inside = self.definitions.list_conditions(one.node) if one.function is not place.function else ()
+                yield from self._expand(one, weight, own, (*conditions, *inside))
             if not found:
                 yield Summand(own or ast.unparse(place.node), place, weight, conditions, replaces)
         for order, assigned in enumerate(before):
-            deeper = dataclasses.replace(place, node=assigned.value, depth=place.depth + 1)
-            tests = conditions + self._list_conditions(assigned.statement, place.function)
-            looped = self._expand_loop(deeper, assigned, assigned.sign * weight, tests) if assigned.adds else None
-            if looped is not None:
-                yield from looped
-                continue
-            parts = self.definitions.select(deeper, assigned.element)
-            if not parts:
-                yield Summand(own or ast.unparse(place.node), place, weight, tests)
-            for part in parts:
-                # What is added is a part of its own, and its name is not that of the sum.
-                title = own if len(before) == 1 else ""
-                yield from self._expand(part, assigned.sign * weight, title, tests, order > 0 and not assigned.adds)
-
-    def _list_conditions(self, node: ast.AST, function: Function) -> tuple[Condition, ...]:
-        found: list[Condition] = []
-        while node is not function and node in self.source.parents:
-            parent = self.source.parents[node]
-            if isinstance(parent, ast.If) and node is not parent.test:
-                found.append((parent.test, node in parent.body))
-            node = parent
-        return tuple(found)
+            tests = (*conditions, *self.definitions.list_conditions(assigned.statement))
+            for value, sign in assigned.parts:
+                deeper = dataclasses.replace(place, node=value, depth=place.depth + 1)
+                looped = self._expand_loop(deeper, assigned, sign * weight, tests) if assigned.added else None
+                if looped is not None:
+                    yield from looped
+                    continue
+                parts = self.definitions.select(deeper, assigned.element)
+                if not parts:
+                    yield Summand(own or ast.unparse(place.node), place, weight, tests)
+                for part in parts:
+                    # What is added is a part of its own, and its name is not that of the sum.
+                    title = own if len(before) == 1 and len(assigned.added) < 2 else ""
+                    yield from self._expand(part, sign * weight, title, tests, order > 0 and not assigned.added)
 
     def _expand_sum(
         self, place: ReadExpression, call: ast.Call, weight: float, conditions: tuple[Condition, ...]
@@ -185,14 +180,14 @@ class RewardReader:
                     yield from self._expand_over(place, loop.target, loop.iter, elt, weight, conditions) or ()
 
     def _expand_loop(
-        self, place: ReadExpression, one: Assigned, weight: float, conditions: tuple[Condition, ...]
+        self, place: ReadExpression, one: Assignment, weight: float, conditions: tuple[Condition, ...]
     ) -> Iterator[Summand] | None:
         """Return the summands of a loop through a dictionary that adds each entry."""
         node: ast.AST = one.statement
         while node is not place.function:
             node = self.source.parents[node]
             if isinstance(node, ast.For):
-                return self._expand_over(place, node.target, node.iter, one.value, weight, conditions)
+                return self._expand_over(place, node.target, node.iter, place.node, weight, conditions)
         return None
 
     def _expand_over(
@@ -235,18 +230,8 @@ class RewardReader:
         for order, (key, one, tests) in enumerate(entries):
             total = weight
             for factor in others:
-                total *= self._read_nth(factor, order, len(entries))
+                total *= self.numbers.read_nth(factor, order, len(entries))
             yield from self._expand(one, total, key, conditions + tests)
-
-    def _read_nth(self, node: ast.expr, order: int, count: int) -> float:
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
-            return float(node.value)
-        one = self.source.find(node)
-        for call in self.calls if one is not None else ():
-            values = call.values.get(one.number, []) if one is not None else []
-            if len(values) == count and isinstance(values[order], float):
-                return float(values[order])  # type: ignore[arg-type]
-        return math.nan
 
     def _list_entries(self, place: ReadExpression) -> Iterator[tuple[str, ReadExpression, tuple[Condition, ...]]]:
         """Yield the keys of a dictionary, with their values, and where they are given."""
@@ -275,7 +260,7 @@ class RewardReader:
                     yield from self._list_entries(place.at(through))
             case ast.Name() | ast.Attribute():
                 for one in self.definitions.list_before(place):
-                    tests = self._list_conditions(one.statement, place.function)
+                    tests = tuple(self.definitions.list_conditions(one.statement))
                     for part in self.definitions.select(place.at(one.value), one.element):
                         yield from ((*entry[:2], tests + entry[2]) for entry in self._list_entries(part))
                 yield from self._list_single(place)
@@ -289,60 +274,15 @@ class RewardReader:
     def _list_single(self, place: ReadExpression) -> Iterator[tuple[str, ReadExpression, tuple[Condition, ...]]]:
         """Yield what is assigned to single keys of a dictionary."""
         text = ast.unparse(place.node)
-        for name, several in self.definitions.list_assigned(place.function).items():
-            if name.startswith(f"{text}["):
-                for one in several:
-                    target = ast.parse(name, mode="eval").body
-                    key = target.slice if isinstance(target, ast.Subscript) else None
-                    if isinstance(key, ast.Constant) and one.statement.lineno < place.node.lineno:
-                        yield str(key.value), place.at(one.value), self._list_conditions(one.statement, place.function)
-
-    def read_constant(self, node: ast.expr) -> float | None:
-        """Return the number of a constant, of a name in capitals, or of an attribute that `step` never assigns."""
-        match node:
-            case ast.Constant(value=bool() | str()):
-                return None
-            case ast.Constant(value=int() | float() as value):
-                return float(value)
-            case ast.UnaryOp(op=ast.USub(), operand=operand):
-                inner = self.read_constant(operand)
-                return None if inner is None else -inner
-            case ast.BinOp(left=left, right=right):
-                parts = self.read_constant(left), self.read_constant(right)
-                if None in parts:
-                    return None
-            case ast.Name(id=name) if not name.isupper():
-                return None
-            case ast.Name(id=name):
-                known = [vars(module)[name] for module in self.source.modules if name in vars(module)]
-                if known and isinstance(known[0], int | float):
-                    return float(known[0])
-            case ast.Attribute() | ast.Subscript():
-                text = ast.unparse(node)
-                if any(text in self.definitions.list_assigned(one) for one in self.definitions.called):
-                    return None
-                if text.startswith("self.") and isinstance(node, ast.Attribute):
-                    kept = getattr(self.source.author, node.attr, None)
-                    if type(kept) in (int, float) and text.count(".") == 1:
-                        return float(kept)  # type: ignore[arg-type]
-            case _:
-                return None
-        values = self.list_values(node)
-        return float(values[0]) if values.size and (values == values[0]).all() else None
-
-    def list_values(self, node: ast.expr) -> NDArray[np.float64]:
-        """Return all numbers that an expression was worth in the steps, in one row."""
-        if node not in self._values:
-            self._values[node] = self._join_values(node)
-        return self._values[node]
-
-    def _join_values(self, node: ast.expr) -> NDArray[np.float64]:
-        one = self.source.find(node)
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
-            return np.array([float(node.value)])
-        found = [value for call in self.calls for value in call.values.get(one.number, [])] if one is not None else []
-        numbers = [np.ravel(value) for value in found if value is not None]
-        return np.concatenate(numbers) if numbers else np.zeros(0)
+        for several in self.definitions.list_assigned(place.function).values():
+            for one in several:
+                match one.target:
+                    case ast.Subscript(value=owner, slice=ast.Constant(value=key)) if (
+                        ast.unparse(owner) == text and one.is_known and one.statement.lineno < place.node.lineno
+                    ):
+                        for value, _ in one.parts:
+                            tests = tuple(self.definitions.list_conditions(one.statement))
+                            yield str(key), place.at(value), tests
 
 
 def list_product(node: ast.expr) -> list[ast.expr]:
@@ -353,17 +293,3 @@ def list_product(node: ast.expr) -> list[ast.expr]:
         case ast.Call(func=ast.Name(id="float"), args=[only]):
             return list_product(only)
     return [node]
-
-
-def read_name(node: ast.expr) -> str:
-    """Return what a name, an attribute, an entry or a function is called; empty for other expressions."""
-    match node:
-        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.Subscript(slice=ast.Constant(value=str(name))):
-            return name
-        case ast.Call(func=ast.Name() | ast.Attribute() as function):
-            called = read_name(function)
-            inner = node.args[0] if node.args else function.value if isinstance(function, ast.Attribute) else None
-            return read_name(inner) if called in CONVERSIONS and inner is not None else called
-        case ast.Subscript(value=owner):
-            return read_name(owner)
-    return ""

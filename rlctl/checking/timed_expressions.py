@@ -11,13 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from rlctl.checking.assignments import list_values
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.expressions import Expression, NotedCall, SourceCode, Value
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.step_times import SUBSTEP_WORDS, StepTimes, require_step_times
 from rlctl.checking.term_names import split_name
-from rlctl.checking.term_weights import find_assigned
 
 TIME_WORDS = {"dt", "timestep", "h", "ts"}
 RATE_WORDS = {"hz", "freq", "frequency", "fps", "rate"}
@@ -199,7 +199,7 @@ def _is_named_time(node: ast.expr, one: Expression) -> bool:
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
             return any(_is_named_time(a, one) and _is_count(b, one) for a, b in ((left, right), (right, left)))
         case ast.Name(id=name):
-            assigned = find_assigned(one.function, name)
+            assigned = list_values(one.function, name)
             if len(assigned) == 1 and _is_named_time(assigned[0], one):
                 return True
     words = _words(node)

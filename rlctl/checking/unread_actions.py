@@ -3,16 +3,16 @@
 import ast
 import collections
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
+from rlctl.checking.assignments import CONVERSIONS
 from rlctl.checking.expressions import Function, SourceCode
-from rlctl.checking.source_mistakes import SourceMistake
+from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.term_names import split_name
 
 ACTORS = {"step", "act", "apply_action", "step_async", "_apply_action", "apply_actions", "_act"}
 COSTS = {"sum", "square", "norm", "mean", "abs", "squared", "linalg", "dot", "vdot", "max", "isfinite", "all", "any"}
-SAME_SHAPE = {"clip", "asarray", "array", "copy", "astype", "float", "float64", "float32", "nan_to_num", "reshape"}
-SAME_SHAPE |= {"atleast_2d", "ravel", "flatten", "tanh"}
+SAME_SHAPE = CONVERSIONS | {"atleast_2d", "clip", "reshape", "tanh"}
 OLD_WORDS = {"last", "prev", "previous", "old", "change", "delta", "history", "before", "diff", "cost", "penalty"}
 
 
@@ -26,7 +26,9 @@ class _Uses:
     is_whole: bool = False  # something else may read all elements
 
 
-def find_unread_elements(source: SourceCode, evaluated: set[Function], size: int) -> Iterator[SourceMistake]:
+def find_unread_elements(
+    rule: Rule, source: SourceCode, evaluated: Collection[ast.AST], size: int
+) -> Iterator[RuleFinding]:
     """Yield each element of an action of `size` numbers that is never read, in a function that reads one element in
     two statements, and nothing as a whole but for costs; only functions that were evaluated count."""
     for file, tree in source.trees.items():
@@ -46,7 +48,7 @@ def find_unread_elements(source: SourceCode, evaluated: set[Function], size: int
                 )
                 message += f" and {name}[{missing[0]}] never"
                 evidence = {"element": f"{name}[{missing[0]}]", "value": missing[0]}
-                yield SourceMistake("RL701", message, evidence, (file, nodes[-1].lineno))
+                yield RuleFinding(rule, message, evidence, where=(file, nodes[-1].lineno))
 
 
 def _list_vectors(function: Function) -> list[str]:

@@ -2,7 +2,11 @@
 
 import pytest
 
-from rlctl.checking.source_mistakes import MISTAKES
+from rlctl.checking.check import judge
+from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
+from rlctl.checking.records import Records
+from rlctl.checking.rule import RuleFinding
+from rlctl.checking.rules import RULES
 from tests.checking.judging import findings, records_of
 
 TURNED = ["RL124KiteDown", "RL124KiteNorth", "RL125KiteWay", "RL124KiteLens", "RL125BargeWay", "RL701BargeCopied"]
@@ -10,34 +14,34 @@ TURNED += ["RL129SkiffWayInTheWorld"]
 COMPARED = ["RL834BipedAsksForBodies", "RL834BipedAsksForJoints", "RL835BipedLeftTwice", "RL835BipedTwoOfTheRight"]
 
 
-def find_mistakes(task):
-    """The rules of the mistakes that the source alone shows."""
-    return {mistake.rule for mistake in records_of(task, "build", "expressions").facts[MISTAKES]}
+def find_rules(task):
+    """The rules that find something in the lines alone."""
+    return {finding.rule for finding in records_of(task, "build", "expressions").facts[BY_EXPRESSIONS]}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TURNED)
 def test_a_line_turns_a_vector_the_wrong_way_or_leaves_out_an_element_of_the_action(name):
-    assert find_mistakes(f"broken_lines.py:{name}") == {name[:5]}
+    assert find_rules(f"broken_lines.py:{name}") == {name[:5]}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMPARED)
 def test_a_line_compares_or_looks_up_the_wrong_ids(name):
     pytest.importorskip("mujoco")
-    assert find_mistakes(f"broken_ids.py:{name}") == {name[:5]}
+    assert find_rules(f"broken_ids.py:{name}") == {name[:5]}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["broken_lines.py:Kite", "broken_lines.py:Barge", "broken_lines.py:Skiff"])
 def test_their_twins_are_right(task):
-    assert find_mistakes(task) == set()
+    assert find_rules(task) == set()
 
 
 @pytest.mark.slow
 def test_the_twin_that_compares_geoms_is_right():
     pytest.importorskip("mujoco")
-    assert find_mistakes("broken_ids.py:Biped") == set()
+    assert find_rules("broken_ids.py:Biped") == set()
 
 
 @pytest.mark.slow
@@ -46,3 +50,11 @@ def test_a_finding_names_the_line():
     assert "matrix.T @ LENS" in finding.message
     assert finding.where is not None
     assert finding.where[0].endswith("broken_lines.py")
+
+
+def test_a_line_is_not_reported_where_an_experiment_has_shown_the_same():
+    records = Records("any", normalizes=lambda what: False)
+    records.facts[BY_EXPRESSIONS] = [RuleFinding(RULES["RL129"], "a line", same=["RL124"])]
+    assert [finding.message for finding in judge(records, ["RL129"]).findings] == ["a line"]
+    records.findings.append(RuleFinding(RULES["RL124"], "elements of the observation"))
+    assert judge(records, ["RL129"]).findings == []

@@ -5,27 +5,21 @@ import ast
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from rlctl.checking.compared_ids import find_doubled_ids, find_wrong_ids
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import PROBE, JudgeHook, experiment
 from rlctl.checking.expressions import ExpressionRecorder, NotedCall, SourceCode, record_expressions
 from rlctl.checking.instance import Context, EnvironmentRaised
-from rlctl.checking.observed_frames import find_world_vectors
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, RuleFinding
-from rlctl.checking.source_mistakes import MISTAKES, SourceMistake
 from rlctl.checking.summands import RewardReader
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
-from rlctl.checking.unread_actions import find_unread_elements
-from rlctl.checking.values import find_author, list_own_classes
 from rlctl.checking.vector_series import VectorSeries
-from rlctl.checking.wrong_turns import TurnedVectors, find_wrong_turns
+from rlctl.checking.wrong_turns import TurnedVectors
 
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
@@ -67,18 +61,15 @@ class NotedEpisodes:
             self._times.append(read_clock() - began)
         return played
 
-    def is_used(self, cls: ast.ClassDef) -> bool:
-        """Say whether a class is one of the environment, or does something in its episodes."""
-        return cls.name in self._own_names or any(node in self._evaluated for node in cls.body)
+    @functools.cached_property
+    def definitions(self) -> Definitions:
+        """What defines the expressions."""
+        return Definitions(self.source, self.episodes)
 
     @functools.cached_property
-    def _own_names(self) -> set[str]:
-        return {own.__name__ for own in list_own_classes(find_author(self.context.instance.env))}
-
-    @functools.cached_property
-    def _evaluated(self) -> set[ast.AST]:
-        calls = [call for episode in self.episodes for call in episode]
-        return {self.source.expressions[number].function for call in calls for number in call.values}
+    def of_steps(self) -> Collection[ast.AST]:
+        """The functions that steps run."""
+        return {self.source.expressions[number].function for call in self.steps for number in call.values}
 
     @property
     def steps(self) -> list[NotedCall]:
@@ -86,11 +77,16 @@ class NotedEpisodes:
         return [call for episode in self.episodes for call in episode[1:]]
 
     @functools.cached_property
+    def turned(self) -> TurnedVectors:
+        """The vectors that the source turns."""
+        return TurnedVectors(VectorSeries(self.source, self.episodes))
+
+    @functools.cached_property
     def reward(self) -> RewardReader:
         """What is added up to the reward."""
         author = self.source.author
         weights = {} if hasattr(author, "step") else getattr(author, "reward_weights", {})  # of a task
-        return RewardReader(self.source, self.steps, weights)
+        return RewardReader(self.definitions, self.steps, weights)
 
 
 BY_EXPRESSIONS = "findings by expressions"
@@ -130,20 +126,6 @@ def note_expressions(context: Context) -> Iterator[ChildMessage]:
     """Show what was noted to all judges."""
     with noted_episodes(context) as noted:
         yield Fact(TIMED, find_timed_expressions(noted.source, noted.episodes))
-        size = int(np.prod(getattr(context.instance.env.action_space, "shape", None) or 0))
-        yield Fact(MISTAKES, list(_find_mistakes(noted, size)))
         shown = list(judges_expressions.judge(noted))
     yield Fact(BY_EXPRESSIONS, [message for message in shown if isinstance(message, RuleFinding)])
     yield from (message for message in shown if not isinstance(message, RuleFinding))
-
-
-def _find_mistakes(noted: NotedEpisodes, size: int) -> Iterator[SourceMistake]:
-    """Yield the mistakes of lines, for the rules that other experiments judge, too; the action has `size` numbers."""
-    source, numbers = noted.source, {number for call in noted.steps for number in call.values}
-    evaluated = {source.expressions[number].function for number in numbers}
-    turned = TurnedVectors(VectorSeries(source, noted.episodes))
-    yield from find_wrong_turns(turned)
-    yield from find_world_vectors(turned)
-    yield from find_wrong_ids(source, noted.episodes)
-    yield from find_doubled_ids(source, evaluated)
-    yield from find_unread_elements(source, evaluated, size)

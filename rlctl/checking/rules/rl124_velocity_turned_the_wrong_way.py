@@ -1,23 +1,24 @@
 """RL124: velocity turned the wrong way."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking import attitudes
+from rlctl.checking import attitudes, wrong_turns
 from rlctl.checking.body_frames import BodyFrame, find_body_frames
 from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.fixed_directions import find_turned_directions, list_body_turns
 from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import Turn, list_world_turns
-from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
 RULE = Rule(
@@ -68,13 +69,18 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         yield from found or _find_directions(one.observed, one.episodes, list_world_turns(one))
 
 
-@judges_records(RULE, "worlds", "attributes", "expressions")
+@judges_records(RULE, "worlds", "attributes")
 def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog | None = records.facts.get("attributes")
-    found = (
-        list(find_wrong_turns(log)) if log is not None and not np.isfinite(log.physics_s) else []
-    )  # an engine tells more
-    yield from found or report_mistakes(records, RULE)
+    if log is not None and not np.isfinite(log.physics_s):  # an engine tells more
+        yield from find_wrong_turns(log)
+
+
+@judges_expressions(RULE, decides=False)
+def _find_wrong_turns_of_lines(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    mixed = wrong_turns.find_mixed_frames(RULE, noted.turned)
+    found = itertools.chain(mixed, wrong_turns.find_wrong_turns(RULE, noted.turned, of_ways=False))
+    yield from itertools.islice(found, 1)
 
 
 def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:

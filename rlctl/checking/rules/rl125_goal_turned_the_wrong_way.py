@@ -1,6 +1,7 @@
 """RL125: goal turned the wrong way."""
 
 import collections
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -8,15 +9,15 @@ import numpy as np
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_world
-from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Records
+from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
+from rlctl.checking.wrong_turns import find_wrong_turns
 from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
@@ -47,9 +48,9 @@ class _Frame(NamedTuple):
     link: Link
 
 
-@judges_records(RULE, "expressions")
-def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE)
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_wrong_turns(RULE, noted.turned, of_ways=True), 1)
 
 
 @judges_goals(RULE)

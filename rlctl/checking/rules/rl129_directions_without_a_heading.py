@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.rotated import RotatedRobot, judges_rotated
-from rlctl.checking.records import FIRST_SEED, Records
+from rlctl.checking.observed_frames import find_world_vectors
+from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
-from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.transitions import name_floats
 from rlctl.checking.turnings import Turning
 
@@ -44,9 +44,9 @@ MATTERS = 0.25  # part of what rewards differ by in episodes that are not turned
 TINY = 1e-4  # of rewards
 
 
-@judges_records(RULE, "expressions")
-def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE)
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_world_vectors(RULE, noted.turned, noted.definitions), 1)
 
 
 @judges_rotated(RULE)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.checking.assignments import CONVERSIONS
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -40,7 +41,6 @@ EXACT = 1e-4  # of the term's size
 BOTH = 0.05  # part of the largest size that a term has on either side of 0
 FEWEST_STEPS, MOST_STEPS = 50, 2_000
 SUMS = {"sum", "mean", "nansum", "nanmean", "average"}
-CONVERSIONS = {"clip", "asarray", "array", "float32", "float64", "astype", "copy", "ravel", "flatten", "clamp"}
 ACTION_NAMES = {"action", "actions", "act", "a", "u", "ctrl", "control", "controls"}
 REWARD_WORDS = {"reward", "rewards", "rew"}
 
@@ -154,7 +154,7 @@ def _only_converts(value: Any) -> bool:
     match value:
         case ast.Name():
             return True
-        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in CONVERSIONS:
+        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in {*CONVERSIONS, "clamp", "clip"}:
             inner = [value.func.value] if isinstance(value.func, ast.Attribute) else []
             inner = [one for one in inner if not isinstance(one, ast.Name)]
             return all(_only_converts(one) for one in [*inner, *value.args[:1]])
@@ -197,7 +197,7 @@ def _is_sum(value: ast.expr, names: set[str]) -> bool:
 def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first cost of the source that is a sum with signs, by what it was worth."""
     for summand, place in ErrorReader(notes).find_sums():
-        paid = summand.weight * notes.reward.list_values(place.node)
+        paid = summand.weight * notes.reward.numbers.list_values(place.node)
         message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} adds up numbers with their"
         message += f" signs: it costs up to {-paid.min():.4g} and pays up to {paid.max():.4g}"
         evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}

@@ -71,7 +71,7 @@ def _find_signed_errors(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     reader = ErrorReader(notes)
     for error in reader.find_errors():
         text, name = ast.unparse(error.place.node), error.summand.name
-        values = notes.reward.list_values(error.place.node)
+        values = notes.reward.numbers.list_values(error.place.node)
         how = f"{error.outer}(...)" if error.outer else "the plain difference"
         message = f"reward term {name!r} rises with {text} and does not end where this is 0: it is {how}, without a"
         message += " square or an absolute value"
@@ -80,7 +80,7 @@ def _find_signed_errors(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         yield RuleFinding(RULE, message, {"element": name}, where=notes.reward.locate(error.place))
         return
     for summand, base in reader.find_powers():
-        values, text = notes.reward.list_values(base.node), ast.unparse(base.node)
+        values, text = notes.reward.numbers.list_values(base.node), ast.unparse(base.node)
         message = f"reward term {summand.name!r} is an even power of {text}, which was {values.min():.3g} to"
         message += f" {values.max():.3g}: -1 pays as much as 1, and is no success"
         yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(base))

@@ -1,15 +1,18 @@
 """RL701: action without effect."""
 
+import itertools
 from collections.abc import Iterator, Mapping
 from typing import Literal, get_args
 
+import numpy as np
+
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
-from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
-from rlctl.checking.records import FIRST_SEED, SECOND_SEED, Records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import OutOfTime, Rule, RuleFinding, Severity, list_names
-from rlctl.checking.source_mistakes import report_mistakes
+from rlctl.checking.unread_actions import find_unread_elements
 
 RULE = Rule(
     "RL701",
@@ -41,9 +44,11 @@ Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 in the observation; or nothing."""
 
 
-@judges_records(RULE, "expressions")
-def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE)
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    shape = getattr(noted.context.instance.env.action_space, "shape", None)
+    size = int(np.prod(shape or 0))
+    yield from itertools.islice(find_unread_elements(RULE, noted.source, noted.of_steps, size), 1)
 
 
 @judges_actions(RULE)

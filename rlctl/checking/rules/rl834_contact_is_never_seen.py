@@ -1,19 +1,20 @@
 """RL834: contact is never seen."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from rlctl.checking.compared_ids import find_wrong_ids
 from rlctl.checking.episode import EpisodePlayer
-from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.feet import BASE, find_feet, list_touched, read_touches
 from rlctl.checking.mujoco_worlds import MujocoStateReader, library
-from rlctl.checking.records import FIRST_SEED, Records
+from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_others
 from rlctl.checking.shared_frames import name_observed
-from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.term_names import is_paid, split_name
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array
@@ -47,9 +48,9 @@ MEANT_WORDS = {"on", "in", "flag", "flags", "force", "forces", "sensor", "sensor
 """What may stand beside the words above without saying that something else is touched."""
 
 
-@judges_records(RULE, "expressions")
-def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE)
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_wrong_ids(RULE, noted.definitions, noted.episodes), 1)
 
 
 @judges_trials(RULE, place=31)

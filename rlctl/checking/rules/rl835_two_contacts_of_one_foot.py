@@ -6,13 +6,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.experiment import judges_records
+from rlctl.checking.compared_ids import find_doubled_ids
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.feet import find_feet, read_touches
-from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import name_observed
-from rlctl.checking.source_mistakes import report_mistakes
 from rlctl.checking.term_names import split_name
 from rlctl.checking.worlds import Array
 
@@ -37,9 +36,9 @@ NEAR = 4  # elements, of which one may be that of another foot
 AT_ENDS = 0.2  # part of its range by which a flag with noise is away from its ends
 
 
-@judges_records(RULE, "expressions")
-def _judge_source(records: Records) -> Iterator[RuleFinding]:
-    yield from report_mistakes(records, RULE)
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_doubled_ids(RULE, noted.source, noted.of_steps), 1)
 
 
 @judges_worlds(RULE)
