@@ -2,22 +2,25 @@
 
 import ast
 import dataclasses
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.definitions import CONVERSIONS, ReadExpression
+from rlctl.checking.assignments import CONVERSIONS, Assignment, read_name
+from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, PART, ErrorReader, has_both_signs
-from rlctl.checking.summands import Summand, list_product, read_name
+from rlctl.checking.expressions import NotedCall
+from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, PART, ErrorReader, Numbers, has_both_signs
+from rlctl.checking.summands import Summand, list_product
 from rlctl.checking.term_names import split_name
 
 SIZES = {"norm", "hypot", "abs", "absolute", "fabs", "square", "sqrt"}
 SAME_SIGN = CONVERSIONS | {"sum", "mean", "max", "min", "clip", "round"}
 BEGINNINGS = {"zeros", "zeros_like"}
-DEEPEST = 10
+MOST_SEEN = 100  # names that are followed
 MET = 0.98  # of the largest value of a kernel: what a tolerance pays that everything meets
-CLEARLY, MOST_CHANGES = 0.5, 0.1  # parts: of the largest difference, of the steps
+CLEARLY, MOST_CHANGES = 0.25, 0.1  # parts: of the largest difference, of the steps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +54,7 @@ class SizeReader:
         """Yield differences that cannot be 0 for half of the commands."""
         for summand in self.reward.summands:
             for place, wanted, other in self._list_differences(summand.place):
-                commands, values = (self.reward.list_values(side.node) for side in (wanted, other))
+                commands, values = (self.reward.numbers.list_values(side.node) for side in (wanted, other))
                 if not has_both_signs(commands, PART) or values.size < FEWEST or values.min() < 0:
                     continue
                 self._lengths = []
@@ -75,9 +78,9 @@ class SizeReader:
         """Say whether the source lets a number be at least 0 only. One that is replaced by a mean of itself and others
         is so if these are."""
         node, key = place.node, (place.function, ast.unparse(place.node))
-        if key in seen or len(seen) > DEEPEST * DEEPEST:
+        if key in seen or len(seen) > MOST_SEEN:
             return key in seen
-        constant = self.reward.read_constant(node)
+        constant = self.reward.numbers.read_constant(node)
         if constant is not None and not isinstance(node, ast.Attribute | ast.Subscript):
             return constant >= 0
         match node:
@@ -96,14 +99,16 @@ class SizeReader:
                 self._lengths.append(node)
                 return True
             case ast.BinOp(left=left, op=ast.Add() | ast.Mult() | ast.Div(), right=right):
-                return all(self._is_never_negative(place.at(side), seen) or self._is_share(side) for side in (left, right))
+                return all(
+                    self._is_never_negative(place.at(side), seen) or self._is_share(side) for side in (left, right)
+                )
             case ast.Name() | ast.Attribute() | ast.Subscript() | ast.Call():
                 return self._is_defined_so(place, seen | {key})
         return False
 
     def _is_share(self, node: ast.expr) -> bool:
         """Say whether it is a constant, or what a share leaves of 1."""
-        values = self.reward.list_values(node)
+        values = self.reward.numbers.list_values(node)
         return bool(values.size and (values == values[0]).all() and values[0] >= 0)
 
     def _is_defined_so(self, place: ReadExpression, seen: set[tuple[object, str]]) -> bool:
@@ -115,16 +120,22 @@ class SizeReader:
             given = place.arguments.get(text)
             return given is not None and self._is_never_negative(given, seen)
         inside = [place.function] if isinstance(place.node, ast.Name) else self.definitions.called
-        assigned = [(one, function) for function in inside for one in self.definitions.list_assigned(function).get(text, ())]
-        for one, function in assigned:
-            here = ReadExpression(one.value, function, place.arguments if function is place.function else {}, place.depth + 1)
-            parts = [self._read_filtered(here, text)] if one.adds else self.definitions.select(here, one.element)
-            seen_here = seen | {(function, text)}
-            if not parts or not all(part is not None and self._is_never_negative(part, seen_here) for part in parts):
-                return False
-        return bool(assigned)
+        assigned = [one for function in inside for one in self.definitions.list_assigned(function).get(text, ())]
+        seen = seen | {(one.function, text) for one in assigned}
+        return bool(assigned) and all(self._is_assigned_so(one, place, text, seen) for one in assigned)
 
-    def _read_filtered(self, place: ReadExpression, text: str) -> ReadExpression | None:
+    def _is_assigned_so(self, one: Assignment, place: ReadExpression, text: str, seen: set[tuple[object, str]]) -> bool:
+        if not one.is_known:
+            return False
+        arguments = place.arguments if one.function is place.function else {}
+        for value, sign in one.parts:
+            here = ReadExpression(value, one.function, arguments, place.depth + 1)
+            parts = [self._read_filtered(here, text)] if one.added else self.definitions.select(here, one.element)
+            if sign < 0 or not parts or not all(self._is_never_negative(part, seen) for part in parts):
+                return False
+        return True
+
+    def _read_filtered(self, place: ReadExpression, text: str) -> ReadExpression:
         """Return x of `y += share * (x - y)`; the value itself where it is not of this form."""
         for factor in list_product(place.node):
             match factor:
@@ -137,7 +148,7 @@ class SizeReader:
         for summand in self.reward.summands:
             for factor in list_product(summand.place.node):
                 place = summand.place.at(factor)
-                values = self.reward.list_values(factor)
+                values = self.reward.numbers.list_values(factor)
                 if values.size < FEWEST or values.min() < MET or values.max() > 1 + 1e-9 or not np.ptp(values) > 0:
                     continue
                 for one, wanted, _ in self._list_differences(place):
@@ -146,18 +157,19 @@ class SizeReader:
 
     def _is_drawn(self, difference: ReadExpression, wanted: ReadExpression) -> bool:
         """Say whether a command differs between episodes as much as the difference to it, and is kept in them."""
-        differences, commands = (self.reward.list_values(one.node) for one in (difference, wanted))
+        differences, commands = (self.reward.numbers.list_values(one.node) for one in (difference, wanted))
         noted = self.notes.source.find(wanted.node)
         if noted is None or differences.size < FEWEST:
             return False
         changes = [
-            not np.array_equal(before, after)  # type: ignore[arg-type]
+            not np.array_equal(before, after)
             for episode in self.notes.episodes
-            for before, after in zip(*(_list_last(episode[begin:end], noted.number) for begin, end in ((1, -1), (2, None))))
+            for before, after in itertools.pairwise(_list_last(episode[1:], noted.number))
         ]
         is_kept = bool(changes) and np.mean(changes) <= MOST_CHANGES
-        return is_kept and np.ptp(commands) > CLEARLY * float(np.abs(differences).max())
+        return bool(is_kept and np.ptp(commands) > CLEARLY * float(np.abs(differences).max()))
 
 
-def _list_last(calls: object, number: int) -> list[object]:
-    return [call.values[number][-1] if call.values.get(number) else None for call in calls]  # type: ignore[attr-defined]
+def _list_last(calls: Sequence[NotedCall], number: int) -> list[Numbers]:
+    values = [call.values[number][-1] if call.values.get(number) else None for call in calls]
+    return [np.asarray(value, np.float64) for value in values if value is not None]

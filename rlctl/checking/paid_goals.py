@@ -127,6 +127,8 @@ class GoalReader:
         if any(summand.place.node in list(ast.walk(one.place.node)) for one in self.reward.differences):
             return True
         others = [one for one in self.reward.summands if one.weight * summand.weight < 0]
+        if set(split_name(summand.name)) & EARLIER_WORDS or any(one.place.node is summand.place.node for one in others):
+            return True
         return any(set(split_name(one.name)) & EARLIER_WORDS or self._is_earlier(one.place) for one in others)
 
     def _is_earlier(self, place: ReadExpression) -> bool:

@@ -5,6 +5,8 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.forced_rewards import ForcedRewards
 from rlctl.checking.goal_distances import DistanceReader
@@ -51,12 +53,12 @@ class SuccessReader:
         return found
 
     def _decides(self, place: ReadExpression) -> bool:
-        """Say whether a summand of the reward depends on success."""
-        conditions = [test for one in self.goals.reward.summands for test, _ in one.conditions]
-        tests = [part for test in conditions for part in ast.walk(test) if isinstance(part, ast.expr)]
-        tests += [one.place.node for one in self.goals.reward.summands]
-        text = ast.unparse(place.node)
-        return any(ast.unparse(test) == text or self.goals.is_success(test, place) for test in tests)
+        """Say whether the reward is another one where success is told otherwise."""
+        last = self.forced.find_last(EPISODES[0])
+        if last is None:
+            return False
+        paid = [self._pay(EPISODES[0], last, {}, dict.fromkeys(self._list_same(place), told)) for told in (False, True)]
+        return all(map(math.isfinite, paid)) and paid[0] != paid[1]
 
     def _find_number(self, place: ReadExpression) -> int | None:
         one = self.notes.source.find(place.node)
@@ -111,7 +113,11 @@ class SuccessReader:
                     before, lacks = paid, text
         least = max(LEAST, CLEARLY * max(abs(best), abs(before)))
         is_known = math.isfinite(best) and math.isfinite(before)
-        return LowSuccess(place, self._find_paid(place), best, before, lacks) if is_known and before > best + least else None
+        return (
+            LowSuccess(place, self._find_paid(place), best, before, lacks)
+            if is_known and before > best + least
+            else None
+        )
 
     def _list_failures(self, flags: list[tuple[str, Flags]], met: Flags, success: Flags) -> Iterator[tuple[str, Flags]]:
         """Yield what is true of steps without a success: nothing that is known, or all but one flag."""
@@ -128,4 +134,4 @@ class SuccessReader:
         """Say whether this is a success at such distances; or the episode ends before, as it does at one."""
         noted = self.forced.pay(episode, last, near, LASTING)[1]
         values = noted.values.get(self._find_number(place) or 0, []) if noted is not None else [1.0]
-        return any(value is not None and bool((value != 0).any() if hasattr(value, "any") else value) for value in values)
+        return any(value is not None and bool(np.any(value)) for value in values)

@@ -5,10 +5,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import CLEAR, EARLIER_WORDS, FEWEST, ErrorReader, has_both_signs
-from rlctl.checking.summands import Summand, read_name
+from rlctl.checking.summands import REWARD_NAMES, Summand
 from rlctl.checking.term_names import COST_WORDS, OPPOSITE_WORDS, split_name
 
 SMALL_WORDS = COST_WORDS | {
@@ -18,7 +19,7 @@ SMALL_WORDS = COST_WORDS | {
     "turned", "twist", "upright", "wobble", "yaw",
 }  # fmt: skip
 """What a cost is named after that should be 0."""
-MEANT_WORDS = (OPPOSITE_WORDS - {"reward", "exp"}) | {
+MEANT_WORDS = (OPPOSITE_WORDS - {"exp"}) | {
     "ahead", "along", "cos", "energy", "forward", "gain", "height", "potential", "power", "torque", "up", "upward",
     "work", "dot", "advantage",
 }  # fmt: skip
@@ -55,7 +56,7 @@ class SignedCostReader:
         return hops
 
     def _has_both_signs(self, place: ReadExpression) -> bool:
-        values = self.reward.list_values(place.node)
+        values = self.reward.numbers.list_values(place.node)
         if values.size < FEWEST or not has_both_signs(values, CLEAR):
             return False
         low, high = float(-values.min()), float(values.max())
@@ -73,7 +74,7 @@ class SignedCostReader:
 
     def _should_be_small(self, summand: Summand, hops: list[ReadExpression]) -> bool:
         """Say whether it is named so, or whether the source takes its size elsewhere."""
-        words = set(split_name(summand.name))
+        words = {word for name in (summand.name, *summand.names) for word in split_name(name)} - REWARD_NAMES
         for hop in hops:
             words |= {
                 word

@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from rlctl.checking.assignments import Assignment, read_name
+from rlctl.checking.assignments import Assignment, read_converted, read_name
 from rlctl.checking.definitions import DEEPEST, Definitions, ReadExpression
 from rlctl.checking.expressions import Function, NotedCall
 from rlctl.checking.noted_numbers import NotedNumbers
@@ -14,6 +14,7 @@ from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
 SUMS = {"sum", "nansum", "mean", "nanmean", "average", "fsum"}
+REWARD_NAMES = {"r", "ret", "rew", "reward", "rewards", "total"}  # of the whole
 MOST_SUMMANDS = 200
 Condition = tuple[ast.expr, bool]  # a test, and whether it is true where the summand counts
 
@@ -27,6 +28,7 @@ class Summand:
     weight: float  # the product of these and of the signs; NaN where it is not known
     conditions: tuple[Condition, ...] = ()
     replaces: bool = False  # what was added up before
+    names: tuple[str, ...] = ()  # of the variables and functions through which it was reached
 
     @property
     def text(self) -> str:
@@ -48,6 +50,7 @@ class RewardReader:
             if isinstance(node, Function)
         }
         self._differences: list[Summand] = []
+        self._path: list[str] = []  # names through which summands are being reached
 
     @functools.cached_property
     def summands(self) -> Sequence[Summand]:
@@ -104,9 +107,11 @@ class RewardReader:
             return self._expand(place.at(node), factor * weight, name, conditions + more, replaces)
 
         match place.node:
+            case ast.BinOp(left=ast.BinOp(op=ast.Mod()), op=ast.Add() | ast.Sub()):  # an angle within half a turn
+                yield self._make(name or ast.unparse(place.node), place, weight, conditions, replaces)
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as operator, right=right):
                 if isinstance(operator, ast.Sub):
-                    self._differences.append(Summand(name, place, weight, conditions))
+                    self._differences.append(self._make(name, place, weight, conditions))
                 yield from go(left)
                 yield from go(right, 1.0 if isinstance(operator, ast.Add) else -1.0)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -127,17 +132,29 @@ class RewardReader:
                 yield from go(orelse, 1.0, ((test, False),))
             case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called)) if called in SUMS:
                 parts = list(self._expand_sum(place, place.node, weight, conditions))
-                yield from parts or [Summand(name or called, place, weight, conditions, replaces)]
+                yield from parts or [self._make(name or called, place, weight, conditions, replaces)]
             case ast.Call() | ast.Name() | ast.Attribute() | ast.Subscript():
                 yield from self._expand_name(place, weight, name, conditions, replaces)
             case _:
-                yield Summand(name or ast.unparse(place.node), place, weight, conditions, replaces)
+                yield self._make(name or ast.unparse(place.node), place, weight, conditions, replaces)
+
+    def _make(
+        self, name: str, place: ReadExpression, weight: float, conditions: tuple[Condition, ...], replaces: bool = False
+    ) -> Summand:
+        return Summand(name, place, weight, conditions, replaces, tuple(self._path))
 
     def _expand_name(
         self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
     ) -> Iterator[Summand]:
+        self._path.append(read_name(place.node))
+        yield from self._expand_definitions(place, weight, name, conditions, replaces)
+        self._path.pop()
+
+    def _expand_definitions(
+        self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
+    ) -> Iterator[Summand]:
         own = name or read_name(place.node)
-        if "reward" in split_name(own):
+        if REWARD_NAMES & set(split_name(own)):
             own = ""
         before = [] if isinstance(place.node, ast.Call) else self.definitions.list_before(place)
         if not before:
@@ -146,7 +163,7 @@ class RewardReader:
                 inside = self.definitions.list_conditions(one.node) if one.function is not place.function else ()
                 yield from self._expand(one, weight, own, (*conditions, *inside))
             if not found:
-                yield Summand(own or ast.unparse(place.node), place, weight, conditions, replaces)
+                yield self._make(own or ast.unparse(place.node), place, weight, conditions, replaces)
         for order, assigned in enumerate(before):
             tests = (*conditions, *self.definitions.list_conditions(assigned.statement))
             for value, sign in assigned.parts:
@@ -157,7 +174,7 @@ class RewardReader:
                     continue
                 parts = self.definitions.select(deeper, assigned.element)
                 if not parts:
-                    yield Summand(own or ast.unparse(place.node), place, weight, tests)
+                    yield self._make(own or ast.unparse(place.node), place, weight, tests)
                 for part in parts:
                     # What is added is a part of its own, and its name is not that of the sum.
                     title = own if len(before) == 1 and len(assigned.added) < 2 else ""
@@ -208,7 +225,26 @@ class RewardReader:
         names = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
         if not entries or not names:
             return None
+        if factor := self._find_function_of_values(elt, target, through, dictionary):
+            return iter([self._make(ast.unparse(factor), place.at(elt), weight, conditions)])
         return self._weigh_entries(place, entries, dictionary, names, elt, weight, conditions)
+
+    def _find_function_of_values(
+        self, elt: ast.expr, target: ast.expr, through: ast.expr, dictionary: ast.expr
+    ) -> ast.expr | None:
+        """Return a factor that is another function of an entry's value than the value itself, such as its size."""
+        values = {f"{ast.unparse(dictionary)}[{ast.unparse(target)}]"}
+        match through, target:
+            case ast.Call(func=ast.Attribute(attr="items")), ast.Tuple(elts=[_, value]):
+                values.add(ast.unparse(value))
+            case ast.Call(func=ast.Attribute(attr="values")), _:
+                values.add(ast.unparse(target))
+        for factor in list_product(elt):
+            parts = [ast.unparse(part) for part in ast.walk(factor) if isinstance(part, ast.expr)]
+            is_converted = read_converted(factor) is not None
+            if values & set(parts) and ast.unparse(factor) not in values and not is_converted:
+                return factor
+        return None
 
     def _weigh_entries(
         self,

@@ -270,7 +270,9 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         return
     low = SuccessReader(reader).find()
     if low is not None:
-        message = f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
+        message = (
+            f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
+        )
         message += f" {low.before:.4g}" + (f", where only {low.lacks} is not true" if low.lacks else "")
         evidence = {"value": low.success, "expected": f"above {low.before:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(low.paid))

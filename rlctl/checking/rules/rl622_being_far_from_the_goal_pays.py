@@ -374,7 +374,9 @@ def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         return
     for rise in RiseReader(reader).find_rises():
         (close, near), (away, far) = rise.near, rise.far
-        message = f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"
+        message = (
+            f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"
+        )
         message += f" the same steps pay {near:.4g} where it is {close:.3g}, and {far:.4g} where it is {away:.3g}"
         evidence = {"element": rise.name, "value": far, "expected": f"below {near:.6g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(rise.place))

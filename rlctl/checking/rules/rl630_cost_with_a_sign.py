@@ -204,7 +204,7 @@ def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(place))
         return
     for summand, place in SignedCostReader(notes).find():
-        paid = summand.weight * notes.reward.list_values(summand.place.node)
+        paid = summand.weight * notes.reward.numbers.list_values(summand.place.node)
         message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} has a sign: it costs up to"
         message += f" {-paid.min():.4g} and pays up to {paid.max():.4g}"
         evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}

@@ -49,7 +49,9 @@ def _find_unread(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(same[-1].place))
         return
     for one in SizeReader(notes).find_always_met():
-        message = f"reward term {one.summand.name!r} is at least {one.least:.4g} of 1 in all steps, whatever the command"
+        message = (
+            f"reward term {one.summand.name!r} is at least {one.least:.4g} of 1 in all steps, whatever the command"
+        )
         message += f" and the motion are: the tolerance of {ast.unparse(one.place.node)} is far above any difference"
         message += f" {ast.unparse(one.difference)}"
         yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))

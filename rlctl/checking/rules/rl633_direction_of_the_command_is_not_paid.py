@@ -110,7 +110,9 @@ def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(place))
         return
     for one in SizeReader(notes).find_one_sided():
-        message = f"reward term {one.summand.name!r} compares a command that has both signs with {ast.unparse(one.size)},"
+        message = (
+            f"reward term {one.summand.name!r} compares a command that has both signs with {ast.unparse(one.size)},"
+        )
         message += f" which is never negative: {ast.unparse(one.place.node)}"
         yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
         return
