@@ -59,10 +59,10 @@ def test_the_summands_of_a_weighted_loop_have_names_and_weights():
 def test_the_summands_of_a_step_add_up_to_its_reward():
     notes = note("Docker")
     paid = [one for one in notes.reward.summands if not one.conditions]
-    parts = [one.weight * notes.reward.list_values(one.place.node) for one in paid]
+    parts = [one.weight * notes.reward.numbers.list_values(one.place.node) for one in paid]
     steps = len(notes.steps)
     total = sum(np.broadcast_to(part, steps) for part in parts)
-    noted = [(one.text, notes.reward.list_values(one.node)) for one in notes.source.expressions]
+    noted = [(one.text, notes.reward.numbers.list_values(one.node)) for one in notes.source.expressions]
     by_text = {text: values for text, values in noted if values.size}
     assert np.allclose(total + 10 * by_text["bool(gap < 0.1)"], by_text["float(reward)"])
 
