@@ -12,7 +12,8 @@ from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, PART, ErrorReader, Numbers, has_both_signs
-from rlctl.checking.summands import Summand, list_product
+from rlctl.checking.products import list_product
+from rlctl.checking.summands import Summand
 from rlctl.checking.term_names import split_name
 
 SIZES = {"norm", "hypot", "abs", "absolute", "fabs", "square", "sqrt"}

@@ -33,6 +33,7 @@ LENGTHS = {
 }  # fmt: skip
 """Functions of a difference whose values are lengths, or their squares, where they are never negative."""
 AWAY_WORDS = AVOIDED_WORDS | {"drop", "keep", "orbit", "release", "repulse", "standoff", "throw", "thrown", "between"}
+FEWEST_SUMMANDS = 2
 DEEPEST = 8  # parts of an expression that are searched for a difference
 
 
@@ -71,7 +72,8 @@ class DistanceReader:
             if sides is None:
                 continue
             summands = tuple(self._list_summands(one))
-            if summands and self._is_to_be_reached(one, sides, summands):
+            is_unread = len(self._walked) < FEWEST_SUMMANDS  # as in a step that calls the one of another class
+            if (summands or is_unread) and self._is_to_be_reached(one, sides, summands):
                 yield GoalDistance(one, summands, float(values.max()))
 
     def _list_summands(self, one: Expression) -> Iterator[Summand]:

@@ -24,18 +24,9 @@ AVOIDED_WORDS = {
 }  # fmt: skip
 """What a robot keeps away from, or is paid to leave."""
 NEAR_WORDS = {
-    "align",
-    "alignment",
-    "approach",
-    "close",
-    "closeness",
-    "near",
-    "proximity",
-    "reach",
-    "reaching",
-    "track",
+    "align", "alignment", "approach", "close", "closeness", "near", "proximity", "reach", "reaching", "track",
     "tracking",
-}
+}  # fmt: skip
 DISTANCES = {"norm", "hypot", "dist", "distance", "sqrt"}
 KERNELS = {"exp", "closeness", "arrival"}
 SUCCESS_KEYS = {"is_success", "success"}

@@ -6,10 +6,11 @@ import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from rlctl.checking.assignments import Assignment, read_converted, read_name
+from rlctl.checking.assignments import Assignment, read_name
 from rlctl.checking.definitions import DEEPEST, Definitions, ReadExpression
 from rlctl.checking.expressions import Function, NotedCall
 from rlctl.checking.noted_numbers import NotedNumbers
+from rlctl.checking.products import find_function_of_values, list_product
 from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
@@ -225,26 +226,9 @@ class RewardReader:
         names = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
         if not entries or not names:
             return None
-        if factor := self._find_function_of_values(elt, target, through, dictionary):
+        if factor := find_function_of_values(elt, target, through, dictionary):
             return iter([self._make(ast.unparse(factor), place.at(elt), weight, conditions)])
         return self._weigh_entries(place, entries, dictionary, names, elt, weight, conditions)
-
-    def _find_function_of_values(
-        self, elt: ast.expr, target: ast.expr, through: ast.expr, dictionary: ast.expr
-    ) -> ast.expr | None:
-        """Return a factor that is another function of an entry's value than the value itself, such as its size."""
-        values = {f"{ast.unparse(dictionary)}[{ast.unparse(target)}]"}
-        match through, target:
-            case ast.Call(func=ast.Attribute(attr="items")), ast.Tuple(elts=[_, value]):
-                values.add(ast.unparse(value))
-            case ast.Call(func=ast.Attribute(attr="values")), _:
-                values.add(ast.unparse(target))
-        for factor in list_product(elt):
-            parts = [ast.unparse(part) for part in ast.walk(factor) if isinstance(part, ast.expr)]
-            is_converted = read_converted(factor) is not None
-            if values & set(parts) and ast.unparse(factor) not in values and not is_converted:
-                return factor
-        return None
 
     def _weigh_entries(
         self,
@@ -319,13 +303,3 @@ class RewardReader:
                         for value, _ in one.parts:
                             tests = tuple(self.definitions.list_conditions(one.statement))
                             yield str(key), place.at(value), tests
-
-
-def list_product(node: ast.expr) -> list[ast.expr]:
-    """Return the factors of a product."""
-    match node:
-        case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return list_product(left) + list_product(right)
-        case ast.Call(func=ast.Name(id="float"), args=[only]):
-            return list_product(only)
-    return [node]
