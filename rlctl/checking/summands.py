@@ -44,12 +44,8 @@ class RewardReader:
         self.definitions, self.source = definitions, definitions.source
         self.numbers = NotedNumbers(definitions, calls)
         self.weights = weights  # of a task's terms
-        self._files = {
-            node: file
-            for file, tree in self.source.trees.items()
-            for node in ast.walk(tree)
-            if isinstance(node, Function)
-        }
+        functions = [(node, file) for file, tree in self.source.trees.items() for node in ast.walk(tree)]
+        self._files = {node: file for node, file in functions if isinstance(node, Function)}
         self._differences: list[Summand] = []
         self._path: list[str] = []  # names through which summands are being reached
 
@@ -135,7 +131,9 @@ class RewardReader:
                 parts = list(self._expand_sum(place, place.node, weight, conditions))
                 yield from parts or [self._make(name or called, place, weight, conditions, replaces)]
             case ast.Call() | ast.Name() | ast.Attribute() | ast.Subscript():
+                self._path.append(read_name(place.node))
                 yield from self._expand_name(place, weight, name, conditions, replaces)
+                self._path.pop()
             case _:
                 yield self._make(name or ast.unparse(place.node), place, weight, conditions, replaces)
 
@@ -145,13 +143,6 @@ class RewardReader:
         return Summand(name, place, weight, conditions, replaces, tuple(self._path))
 
     def _expand_name(
-        self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
-    ) -> Iterator[Summand]:
-        self._path.append(read_name(place.node))
-        yield from self._expand_definitions(place, weight, name, conditions, replaces)
-        self._path.pop()
-
-    def _expand_definitions(
         self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
     ) -> Iterator[Summand]:
         own = name or read_name(place.node)

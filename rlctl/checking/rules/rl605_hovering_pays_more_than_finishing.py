@@ -29,7 +29,8 @@ RULE = Rule(
         finished, and stopped shortly before its end; or every recorded success pays less than the steps would
         have paid that were left, by what episodes without a success earn. Or the check moved the goal: next to the
         robot, which rests or which the goal accompanies, each step pays, and a success ends that for less. The
-        same is read in the source: what its terms pay at the goal, and what success adds, or replaces them by.
+        same is read in the source: what its terms pay at the goal, and what success adds, or replaces them by; and a
+        step with success set to true pays less than without it, with the goal as near.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for

@@ -30,7 +30,8 @@ RULE = Rule(
         pays. The policy learns full reverse, or to swing to one side. Judged are terms in info['reward_terms'] that are
         such a sum in all steps and are named after a cost, or have a negative weight in a task; and lines of step that
         subtract the plain sum of the action from the reward, where the action may be negative, or any sum whose
-        numbers, and which itself, had both signs.
+        numbers, and which itself, had both signs; or one number that has both, such as the sine of a tilt or a velocity
+        to the side.
     """,
     fix="Sum squares or sizes: np.sum(np.square(action)), or np.sum(np.abs(action)).",
 )

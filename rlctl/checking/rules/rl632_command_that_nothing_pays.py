@@ -19,7 +19,8 @@ RULE = Rule(
         check played the same steps with other values of it, and each reward was the same to the bit, while other
         numbers of the command change the reward. The policy learns to ignore it. Most often the reward compares with
         another element of the command than it should. The source is read, too: two terms compare the same number of
-        the command, and no term another one.
+        the command, and no term another one; or a term of a command is nearly its maximum in all steps, whatever the
+        motion is, since its tolerance is far too wide, or in another unit.
     """,
     fix="""
         Compare each velocity with its own element of the command: if the command is (forward speed, turn rate), the

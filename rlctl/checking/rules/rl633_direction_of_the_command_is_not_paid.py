@@ -21,7 +21,8 @@ RULE = Rule(
         The reward follows how large a command is, and not in which direction it points: the check played the same
         steps with the command turned back, and to the sides, and each reward was the same, while it changes with the
         length of the command. So driving in any direction at the commanded speed is paid in full. Most often two
-        lengths are compared, |v| with |command|, which is also read in the source.
+        lengths are compared, |v| with |command|, which is also read in the source; or a command that has both signs
+        with a number that is never negative, so that half of the commands cannot be met.
     """,
     fix="Take the length of the difference: np.linalg.norm(velocity - command), and not the difference of the lengths.",
 )
