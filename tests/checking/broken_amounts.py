@@ -262,7 +262,8 @@ class PuckIsTolerant(Puck):
 
     def pay(self, action):
         error = self.state["speed"][0] - self.cmd[0]
-        return 1 / (1 + (error / self.width) ** 2) - 0.01 * np.sum(action**2)
+        turn_error = self.state["turning"] - self.cmd[1]
+        return 1 / (1 + (error / self.width) ** 2) + np.exp(-(turn_error**2)) - 0.01 * np.sum(action**2)
 
 
 class RL632PuckIsAlwaysRight(PuckIsTolerant):

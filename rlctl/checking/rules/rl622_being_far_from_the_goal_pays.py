@@ -32,8 +32,8 @@ RULE = Rule(
         true, and at several distances from there. The source is read, too: a function that falls with a distance is
         subtracted, a distance to a goal is added, or what it has grown by in the step; and where the source computes a
         distance to a goal or to an object, it is set to several values, and the same step pays more for larger ones.
-        So the policy learns to keep away from the goal. Most often a sign is wrong, or an error is paid instead of a function that falls with it, or
-        differences are added instead of their sizes.
+        So the policy learns to keep away from the goal. Most often a sign is wrong, or an error is paid instead of a
+        function that falls with it, or differences are added instead of their sizes.
     """,
     fix="""
         Make the reward largest where the task is done: subtract the distance or the error, pay
