@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.summands import SUMS, RewardReader, Summand, list_product
+from rlctl.checking.products import list_product
+from rlctl.checking.summands import SUMS, RewardReader, Summand
 from rlctl.checking.term_names import ENERGY_WORDS, OPPOSITE_WORDS, PLACE_WORDS, split_name
 from rlctl.checking.timed_expressions import spans_steps
 
@@ -56,6 +57,10 @@ class ErrorReader:
         self.definitions = self.reward.definitions
         self._sized = set(_list_sized(notes))
         self._directed = set(_list_directed(notes))
+
+    def is_sized(self, text: str) -> bool:
+        """Say whether the source takes the size of an expression somewhere."""
+        return text in self._sized
 
     def find_errors(self) -> Iterator[SignedError]:
         """Yield the differences with a sign in the reward."""

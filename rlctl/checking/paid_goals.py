@@ -24,18 +24,9 @@ AVOIDED_WORDS = {
 }  # fmt: skip
 """What a robot keeps away from, or is paid to leave."""
 NEAR_WORDS = {
-    "align",
-    "alignment",
-    "approach",
-    "close",
-    "closeness",
-    "near",
-    "proximity",
-    "reach",
-    "reaching",
-    "track",
+    "align", "alignment", "approach", "close", "closeness", "near", "proximity", "reach", "reaching", "track",
     "tracking",
-}
+}  # fmt: skip
 DISTANCES = {"norm", "hypot", "dist", "distance", "sqrt"}
 KERNELS = {"exp", "closeness", "arrival"}
 SUCCESS_KEYS = {"is_success", "success"}
@@ -75,7 +66,7 @@ class GoalReader:
                 words = self._list_words(summand)
                 if words & (NEAR_WORDS | WANTED_WORDS):
                     yield PaidDistance(WrongSign.NEARNESS_COSTS, summand, summand.place)
-            if summand.weight > 0 and self._is_distance_to_goal(summand.place) and not self._is_of_progress(summand):
+            if summand.weight > 0 and self._is_distance_to_goal(summand.place) and not self.is_of_progress(summand):
                 yield PaidDistance(WrongSign.DISTANCE_PAYS, summand, summand.place)
         for summand in self.reward.differences:
             if not self._is_avoided(summand) and self._pays_leaving(summand):
@@ -122,11 +113,13 @@ class GoalReader:
                 return self.errors.is_wanted(inner.at(left)) != self.errors.is_wanted(inner.at(right))
         return False
 
-    def _is_of_progress(self, summand: Summand) -> bool:
+    def is_of_progress(self, summand: Summand) -> bool:
         """Say whether another summand takes away what this one was a step before."""
         if any(summand.place.node in list(ast.walk(one.place.node)) for one in self.reward.differences):
             return True
         others = [one for one in self.reward.summands if one.weight * summand.weight < 0]
+        if set(split_name(summand.name)) & EARLIER_WORDS or any(one.place.node is summand.place.node for one in others):
+            return True
         return any(set(split_name(one.name)) & EARLIER_WORDS or self._is_earlier(one.place) for one in others)
 
     def _is_earlier(self, place: ReadExpression) -> bool:

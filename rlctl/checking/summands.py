@@ -10,10 +10,12 @@ from rlctl.checking.assignments import Assignment, read_name
 from rlctl.checking.definitions import DEEPEST, Definitions, ReadExpression
 from rlctl.checking.expressions import Function, NotedCall
 from rlctl.checking.noted_numbers import NotedNumbers
+from rlctl.checking.products import find_function_of_values, list_product
 from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
 SUMS = {"sum", "nansum", "mean", "nanmean", "average", "fsum"}
+REWARD_NAMES = {"r", "ret", "rew", "reward", "rewards", "total"}  # of the whole
 MOST_SUMMANDS = 200
 Condition = tuple[ast.expr, bool]  # a test, and whether it is true where the summand counts
 
@@ -27,6 +29,7 @@ class Summand:
     weight: float  # the product of these and of the signs; NaN where it is not known
     conditions: tuple[Condition, ...] = ()
     replaces: bool = False  # what was added up before
+    names: tuple[str, ...] = ()  # of the variables and functions through which it was reached
 
     @property
     def text(self) -> str:
@@ -41,13 +44,10 @@ class RewardReader:
         self.definitions, self.source = definitions, definitions.source
         self.numbers = NotedNumbers(definitions, calls)
         self.weights = weights  # of a task's terms
-        self._files = {
-            node: file
-            for file, tree in self.source.trees.items()
-            for node in ast.walk(tree)
-            if isinstance(node, Function)
-        }
+        functions = [(node, file) for file, tree in self.source.trees.items() for node in ast.walk(tree)]
+        self._files = {node: file for node, file in functions if isinstance(node, Function)}
         self._differences: list[Summand] = []
+        self._path: list[str] = []  # names through which summands are being reached
 
     @functools.cached_property
     def summands(self) -> Sequence[Summand]:
@@ -104,9 +104,11 @@ class RewardReader:
             return self._expand(place.at(node), factor * weight, name, conditions + more, replaces)
 
         match place.node:
+            case ast.BinOp(left=ast.BinOp(op=ast.Mod()), op=ast.Add() | ast.Sub()):  # an angle within half a turn
+                yield self._make(name or ast.unparse(place.node), place, weight, conditions, replaces)
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as operator, right=right):
                 if isinstance(operator, ast.Sub):
-                    self._differences.append(Summand(name, place, weight, conditions))
+                    self._differences.append(self._make(name, place, weight, conditions))
                 yield from go(left)
                 yield from go(right, 1.0 if isinstance(operator, ast.Add) else -1.0)
             case ast.UnaryOp(op=ast.USub(), operand=operand):
@@ -127,17 +129,24 @@ class RewardReader:
                 yield from go(orelse, 1.0, ((test, False),))
             case ast.Call(func=ast.Name(id=called) | ast.Attribute(attr=called)) if called in SUMS:
                 parts = list(self._expand_sum(place, place.node, weight, conditions))
-                yield from parts or [Summand(name or called, place, weight, conditions, replaces)]
+                yield from parts or [self._make(name or called, place, weight, conditions, replaces)]
             case ast.Call() | ast.Name() | ast.Attribute() | ast.Subscript():
+                self._path.append(read_name(place.node))
                 yield from self._expand_name(place, weight, name, conditions, replaces)
+                self._path.pop()
             case _:
-                yield Summand(name or ast.unparse(place.node), place, weight, conditions, replaces)
+                yield self._make(name or ast.unparse(place.node), place, weight, conditions, replaces)
+
+    def _make(
+        self, name: str, place: ReadExpression, weight: float, conditions: tuple[Condition, ...], replaces: bool = False
+    ) -> Summand:
+        return Summand(name, place, weight, conditions, replaces, tuple(self._path))
 
     def _expand_name(
         self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool
     ) -> Iterator[Summand]:
         own = name or read_name(place.node)
-        if "reward" in split_name(own):
+        if REWARD_NAMES & set(split_name(own)):
             own = ""
         before = [] if isinstance(place.node, ast.Call) else self.definitions.list_before(place)
         if not before:
@@ -146,7 +155,7 @@ class RewardReader:
                 inside = self.definitions.list_conditions(one.node) if one.function is not place.function else ()
                 yield from self._expand(one, weight, own, (*conditions, *inside))
             if not found:
-                yield Summand(own or ast.unparse(place.node), place, weight, conditions, replaces)
+                yield self._make(own or ast.unparse(place.node), place, weight, conditions, replaces)
         for order, assigned in enumerate(before):
             tests = (*conditions, *self.definitions.list_conditions(assigned.statement))
             for value, sign in assigned.parts:
@@ -157,7 +166,7 @@ class RewardReader:
                     continue
                 parts = self.definitions.select(deeper, assigned.element)
                 if not parts:
-                    yield Summand(own or ast.unparse(place.node), place, weight, tests)
+                    yield self._make(own or ast.unparse(place.node), place, weight, tests)
                 for part in parts:
                     # What is added is a part of its own, and its name is not that of the sum.
                     title = own if len(before) == 1 and len(assigned.added) < 2 else ""
@@ -208,6 +217,8 @@ class RewardReader:
         names = {node.id for node in ast.walk(target) if isinstance(node, ast.Name)}
         if not entries or not names:
             return None
+        if factor := find_function_of_values(elt, target, through, dictionary):
+            return iter([self._make(ast.unparse(factor), place.at(elt), weight, conditions)])
         return self._weigh_entries(place, entries, dictionary, names, elt, weight, conditions)
 
     def _weigh_entries(
@@ -283,13 +294,3 @@ class RewardReader:
                         for value, _ in one.parts:
                             tests = tuple(self.definitions.list_conditions(one.statement))
                             yield str(key), place.at(value), tests
-
-
-def list_product(node: ast.expr) -> list[ast.expr]:
-    """Return the factors of a product."""
-    match node:
-        case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return list_product(left) + list_product(right)
-        case ast.Call(func=ast.Name(id="float"), args=[only]):
-            return list_product(only)
-    return [node]

@@ -1,5 +1,6 @@
 """RL605: hovering pays more than finishing."""
 
+import ast
 import dataclasses
 from collections.abc import Iterator, Sequence
 
@@ -14,6 +15,7 @@ from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
 from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.paid_successes import SuccessReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 
@@ -27,7 +29,8 @@ RULE = Rule(
         finished, and stopped shortly before its end; or every recorded success pays less than the steps would
         have paid that were left, by what episodes without a success earn. Or the check moved the goal: next to the
         robot, which rests or which the goal accompanies, each step pays, and a success ends that for less. The
-        same is read in the source: what its terms pay at the goal, and what success adds, or replaces them by.
+        same is read in the source: what its terms pay at the goal, and what success adds, or replaces them by; and a
+        step with success set to true pays less than without it, with the goal as near.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
@@ -257,7 +260,7 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         yield RuleFinding(RULE, message, finished.at(best.step, **earned))
 
 
-@judges_expressions(RULE, decides=False)
+@judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
 def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Read what the source pays for success, and what it pays in each step next to the goal."""
     reader = GoalReader(notes)
@@ -265,6 +268,15 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message = f"success replaces the reward by {number:.4g}, and a step next to the goal pays up to {income:.4g}"
         evidence = {"value": number, "expected": f"above {income:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
+        return
+    low = SuccessReader(reader).find()
+    if low is not None:
+        message = (
+            f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
+        )
+        message += f" {low.before:.4g}" + (f", where only {low.lacks} is not true" if low.lacks else "")
+        evidence = {"value": low.success, "expected": f"above {low.before:.4g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(low.paid))
         return
     income, bonus = reader.read_income(), reader.read_bonus()
     if bonus is not None and income > 0 and reader.ends_at_success():

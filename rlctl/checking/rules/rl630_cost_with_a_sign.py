@@ -14,6 +14,7 @@ from rlctl.checking.paid_errors import ErrorReader
 from rlctl.checking.records import CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rewards import RAW_TERMS, TERMS, WITH_SEARCH, find_terms, has_terms, require_rewarded
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.signed_costs import SignedCostReader
 from rlctl.checking.term_names import is_about_actions, is_cost, is_error, split_name
 from rlctl.checking.term_weights import list_methods
 from rlctl.checking.transitions import find_float_leaves
@@ -29,7 +30,8 @@ RULE = Rule(
         pays. The policy learns full reverse, or to swing to one side. Judged are terms in info['reward_terms'] that are
         such a sum in all steps and are named after a cost, or have a negative weight in a task; and lines of step that
         subtract the plain sum of the action from the reward, where the action may be negative, or any sum whose
-        numbers, and which itself, had both signs.
+        numbers, and which itself, had both signs; or one number that has both, such as the sine of a tilt or a velocity
+        to the side.
     """,
     fix="Sum squares or sizes: np.sum(np.square(action)), or np.sum(np.abs(action)).",
 )
@@ -201,4 +203,11 @@ def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message += f" signs: it costs up to {-paid.min():.4g} and pays up to {paid.max():.4g}"
         evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(place))
+        return
+    for summand, place in SignedCostReader(notes).find():
+        paid = summand.weight * notes.reward.numbers.list_values(summand.place.node)
+        message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} has a sign: it costs up to"
+        message += f" {-paid.min():.4g} and pays up to {paid.max():.4g}"
+        evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
         return

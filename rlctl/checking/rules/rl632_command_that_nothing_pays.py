@@ -3,6 +3,7 @@
 import ast
 from collections.abc import Iterator
 
+from rlctl.checking.command_sizes import SizeReader
 from rlctl.checking.experiments.commands import CommandTrials, judges_commands
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.paid_commands import CommandReader
@@ -18,7 +19,8 @@ RULE = Rule(
         check played the same steps with other values of it, and each reward was the same to the bit, while other
         numbers of the command change the reward. The policy learns to ignore it. Most often the reward compares with
         another element of the command than it should. The source is read, too: two terms compare the same number of
-        the command, and no term another one.
+        the command, and no term another one; or a term of a command is nearly its maximum in all steps, whatever the
+        motion is, since its tolerance is far too wide, or in another unit.
     """,
     fix="""
         Compare each velocity with its own element of the command: if the command is (forward speed, turn rate), the
@@ -46,4 +48,12 @@ def _find_unread(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message += f" {ast.unparse(same[-1].place.node)}"
         evidence = {"element": f"{command}[{unpaid}]"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(same[-1].place))
+        return
+    for one in SizeReader(notes).find_always_met():
+        message = (
+            f"reward term {one.summand.name!r} is at least {one.least:.4g} of 1 in all steps, whatever the command"
+        )
+        message += f" and the motion are: the tolerance of {ast.unparse(one.place.node)} is far above any difference"
+        message += f" {ast.unparse(one.difference)}"
+        yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
         return

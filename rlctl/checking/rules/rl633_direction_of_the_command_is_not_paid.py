@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rlctl.checking.command_sizes import SizeReader
 from rlctl.checking.drawn_goals import DrawnPlace, Numbers
 from rlctl.checking.experiments.commands import LATER_STEPS, CommandTrials, judges_commands
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -20,7 +21,8 @@ RULE = Rule(
         The reward follows how large a command is, and not in which direction it points: the check played the same
         steps with the command turned back, and to the sides, and each reward was the same, while it changes with the
         length of the command. So driving in any direction at the commanded speed is paid in full. Most often two
-        lengths are compared, |v| with |command|, which is also read in the source.
+        lengths are compared, |v| with |command|, which is also read in the source; or a command that has both signs
+        with a number that is never negative, so that half of the commands cannot be met.
     """,
     fix="Take the length of the difference: np.linalg.norm(velocity - command), and not the difference of the lengths.",
 )
@@ -107,4 +109,11 @@ def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message = f"reward term {summand.name!r} compares lengths only, and nothing compares the direction:"
         message += f" {ast.unparse(place.node)}"
         yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(place))
+        return
+    for one in SizeReader(notes).find_one_sided():
+        message = (
+            f"reward term {one.summand.name!r} compares a command that has both signs with {ast.unparse(one.size)},"
+        )
+        message += f" which is never negative: {ast.unparse(one.place.node)}"
+        yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
         return
