@@ -60,13 +60,13 @@ class Raft(Robot):
         return 10 * gained - 0.1 * abs(self.yaw() - self.heading)
 
 
-class RL642RaftKeepsFirst(Raft):
+class RaftKeepsFirst(Raft):
     def start(self):
         self.keep()
         self.place_it()
 
 
-class RL642RaftHeadingOfTheModel(Raft):
+class RaftHeadingOfTheModel(Raft):
     def start(self):
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
@@ -218,13 +218,13 @@ class Lander(Robot):
         return self.height() - self.start_height
 
 
-class RL642LanderBeginsFirst(Lander):
+class LanderBeginsFirst(Lander):
     def start(self):
         self.begin()
         self.place_it()
 
 
-class RL642LanderUnpacksFirst(Lander):
+class LanderUnpacksFirst(Lander):
     def start(self):
         place, orientation = p.getBasePositionAndOrientation(self.body, physicsClientId=self.cid)
         self.place_it()

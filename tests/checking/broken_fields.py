@@ -74,12 +74,12 @@ class Ram(Robot):
         return float(self.place()[0]) + 0.1 * self.touch()
 
 
-class RL834RamAny(Ram):
+class RamAny(Ram):
     def touch(self):
         return float(any(one[8] > 0.05 for one in self.points()))
 
 
-class RL834RamConstant(Ram):
+class RamConstant(Ram):
     def touch(self):
         points = p.getContactPoints(bodyA=self.body, bodyB=self.box, linkIndexA=0, physicsClientId=self.cid) or ()
         for point in points:
@@ -88,7 +88,7 @@ class RL834RamConstant(Ram):
         return 0.0
 
 
-class RL834RamSum(Ram):
+class RamSum(Ram):
     least = 0.2
 
     def touch(self):
@@ -97,7 +97,7 @@ class RL834RamSum(Ram):
         return 1.0 if self.least < total else 0.0
 
 
-class RL834RamLargest(Ram):
+class RamLargest(Ram):
     def touch(self):
         return float(max((c[8] for c in self.points()), default=0.0) > 1.0)
 
@@ -113,13 +113,13 @@ class RamApart(Ram):
         return float(len(pressing) > 0 and not far and depth < 0.1)
 
 
-class RL842RamForces(Ram):
+class RamForces(Ram):
     def touch(self):
         forces = [one[8] for one in self.points()]
         return float(np.sum(forces))
 
 
-class RL842RamForceSum(Ram):
+class RamForceSum(Ram):
     def contact_force(self):
         return sum(c[8] for c in self.points())
 
@@ -127,14 +127,14 @@ class RL842RamForceSum(Ram):
         return self.contact_force()
 
 
-class RL842RamTorqueAsSpeed(Ram):
+class RamTorqueAsSpeed(Ram):
     def joint(self):
         state = p.getJointState(self.body, 0, physicsClientId=self.cid)
         pos, vel = state[0], state[3]
         return pos, vel
 
 
-class RL842RamSpeeds(Ram):
+class RamSpeeds(Ram):
     def joint(self):
         states = p.getJointStates(self.body, [0], physicsClientId=self.cid)
         q = np.array([state[0] for state in states])
@@ -142,20 +142,20 @@ class RL842RamSpeeds(Ram):
         return q[0], joint_velocities[0]
 
 
-class RL842RamSwapped(Ram):
+class RL839RamSwapped(Ram):
     def joint(self):
         velocity, position, _, _ = p.getJointState(self.body, 0, physicsClientId=self.cid)
         return position, velocity
 
 
-class RL842RamTurnAsSpeed(Ram):
+class RamTurnAsSpeed(Ram):
     def box_velocity(self):
         velocity = p.getBaseVelocity(self.box, physicsClientId=self.cid)
         lin_vel = np.array(velocity[1])
         return lin_vel[0], velocity[1][1]
 
 
-class RL842RamNormalAsPlace(Ram):
+class RamNormalAsPlace(Ram):
     def place(self):
         where = super().place()
         for contact in p.getContactPoints(self.box, self.floor, physicsClientId=self.cid):

@@ -62,14 +62,14 @@ class Pod(Robot):
         return -abs(self.depth - place[2]) - 0.1 * abs(tilt)
 
 
-class RL838PodPushesOnce(Pod):
+class PodPushesOnce(Pod):
     def move(self, action):
         self.drive(action)
         for _ in range(SUBSTEPS):
             self.simulate()
 
 
-class RL838PodPushesAfterwards(Pod):
+class PodPushesAfterwards(Pod):
     def move(self, action):
         [self.simulate() for _ in range(SUBSTEPS)]
         self.drive(action)
@@ -141,7 +141,7 @@ class Swimmer(Pod):
         self.bullet.stepSimulation()
 
 
-class RL838SwimmerPushesOnce(Swimmer):
+class SwimmerPushesOnce(Swimmer):
     def move(self, action):
         self.drive(action)
         for _ in range(SUBSTEPS):
@@ -210,7 +210,7 @@ class RL838SliderTorquesOnce(Slider):
             p.stepSimulation(physicsClientId=self.cid)
 
 
-class RL838SliderTorquesInTheFirst(Slider):
+class SliderTorquesInTheFirst(Slider):
     def move(self, action):
         for number in range(SUBSTEPS):
             if number == 0:
@@ -272,7 +272,7 @@ class Gantry(Robot):
         return -float(np.abs(self.goals - self.data.qpos).sum())
 
 
-class RL838GantryLetsGo(Gantry):
+class GantryLetsGo(Gantry):
     def move(self, action):
         for number in range(SUBSTEPS):
             self.data.ctrl[:] = action if number == 0 else 0.0
@@ -294,7 +294,7 @@ class GantryForces(Gantry):
             self.data.qfrc_applied[:] = 0
 
 
-class RL838GantryForcesOnce(GantryForces):
+class GantryForcesOnce(GantryForces):
     def move(self, action):
         self.push(action)
         for _ in range(SUBSTEPS):
@@ -302,7 +302,7 @@ class RL838GantryForcesOnce(GantryForces):
             self.data.xfrc_applied[:] = 0
 
 
-class RL838GantryJointForcesOnce(Gantry):
+class GantryJointForcesOnce(Gantry):
     def move(self, action):
         self.data.qfrc_applied[:] = 3 * action
         mujoco.mj_step(self.model, self.data)

@@ -9,11 +9,11 @@ pytest.importorskip("mujoco")
 
 FILE = "broken_early.py"
 PAIRS = {
-    "RL642RaftKeepsFirst": "Raft",
-    "RL642RaftHeadingOfTheModel": "RaftNominal",
+    "RaftKeepsFirst": "Raft",
+    "RaftHeadingOfTheModel": "RaftNominal",
     "RL642PuckDistanceBeforeTheSpot": "Puck",
-    "RL642LanderBeginsFirst": "Lander",
-    "RL642LanderUnpacksFirst": "Lander",
+    "LanderBeginsFirst": "Lander",
+    "LanderUnpacksFirst": "Lander",
 }
 CASES = [
     case(f"{FILE}:RL642PuckDistanceBeforeTheSpot", ("RL642", "warning"), twin=f"{FILE}:Puck", pybullet=True, slow=True)
@@ -49,5 +49,5 @@ def test_what_happens_in_between_and_what_is_read_of_the_last_episode(name):
 @pytest.mark.slow
 @pytest.mark.pybullet
 def test_names_both_values():
-    (finding,) = findings(f"{FILE}:RL642RaftHeadingOfTheModel", "RL642")
+    (finding,) = findings(f"{FILE}:RaftHeadingOfTheModel", "RL642")
     assert finding.message.startswith("self.heading = start_yaw reads 0, and at the end of the same reset start_yaw is")

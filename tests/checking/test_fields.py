@@ -1,4 +1,4 @@
-"""RL834, RL842: fields of PyBullet's tuples that are something else than what is meant."""
+"""RL834, RL839: fields of PyBullet's tuples that are something else than what is meant."""
 
 import pytest
 
@@ -7,9 +7,12 @@ from rlctl.checking.rule import RuleFinding
 from tests.checking.judging import case, check_case, mark_slow, records_of
 
 FILE = "broken_fields.py"
-WRONG = ["RL834RamAny", "RL834RamConstant", "RL834RamSum", "RL834RamLargest", "RL842RamForces", "RL842RamForceSum"]
-WRONG += ["RL842RamTorqueAsSpeed", "RL842RamSpeeds", "RL842RamSwapped", "RL842RamTurnAsSpeed", "RL842RamNormalAsPlace"]
-CASES = [case(f"{FILE}:RL842RamSwapped", ("RL842", "warning"), twin=f"{FILE}:Ram", pybullet=True, slow=True)]
+WRONG = dict.fromkeys(["RamAny", "RamConstant", "RamSum", "RamLargest"], "RL834") | dict.fromkeys(
+    ["RamForces", "RamForceSum", "RamTorqueAsSpeed", "RamSpeeds", "RL839RamSwapped", "RamTurnAsSpeed"]
+    + ["RamNormalAsPlace"],
+    "RL839",
+)
+CASES = [case(f"{FILE}:RL839RamSwapped", ("RL839", "warning"), twin=f"{FILE}:Ram", pybullet=True, slow=True)]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
@@ -27,7 +30,7 @@ def read_source(name):
 @pytest.mark.pybullet
 @pytest.mark.parametrize("name", WRONG)
 def test_another_field_is_read(name):
-    assert read_source(name) == {name[:5]}
+    assert read_source(name) == {WRONG[name]}
 
 
 @pytest.mark.slow

@@ -8,14 +8,14 @@ pytest.importorskip("mujoco")
 
 FILE = "broken_short.py"
 PAIRS = {
-    "RL838PodPushesOnce": "Pod",
-    "RL838PodPushesAfterwards": "PodBumped",
-    "RL838SwimmerPushesOnce": "Swimmer",
+    "PodPushesOnce": "Pod",
+    "PodPushesAfterwards": "PodBumped",
+    "SwimmerPushesOnce": "Swimmer",
     "RL838SliderTorquesOnce": "Slider",
-    "RL838SliderTorquesInTheFirst": "SliderVelocities",
-    "RL838GantryLetsGo": "Gantry",
-    "RL838GantryForcesOnce": "GantryForces",
-    "RL838GantryJointForcesOnce": "Gantry",
+    "SliderTorquesInTheFirst": "SliderVelocities",
+    "GantryLetsGo": "Gantry",
+    "GantryForcesOnce": "GantryForces",
+    "GantryJointForcesOnce": "Gantry",
 }
 CASES = [case(f"{FILE}:RL838SliderTorquesOnce", ("RL838", "warning"), twin=f"{FILE}:Slider", pybullet=True, slow=True)]
 

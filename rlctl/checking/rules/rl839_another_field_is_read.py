@@ -1,4 +1,4 @@
-"""RL842: another field is read."""
+"""RL839: another field is read."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
-    "RL842",
+    "RL839",
     "another field is read",
     Severity.WARNING,
     meaning="""
