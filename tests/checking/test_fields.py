@@ -7,11 +7,10 @@ from rlctl.checking.rule import RuleFinding
 from tests.checking.judging import case, check_case, mark_slow, records_of
 
 FILE = "broken_fields.py"
-WRONG = dict.fromkeys(["RamAny", "RamConstant", "RamSum", "RamLargest"], "RL834") | dict.fromkeys(
-    ["RamForces", "RamForceSum", "RamTorqueAsSpeed", "RamSpeeds", "RL839RamSwapped", "RamTurnAsSpeed"]
-    + ["RamNormalAsPlace"],
-    "RL839",
-)
+FORCES = ["RamAny", "RamConstant", "RamSum", "RamLargest"]
+OTHERS = ["RamForces", "RamForceSum", "RamTorqueAsSpeed", "RamSpeeds", "RL839RamSwapped", "RamTurnAsSpeed"]
+OTHERS += ["RamNormalAsPlace"]
+WRONG = dict.fromkeys(FORCES, "RL834") | dict.fromkeys(OTHERS, "RL839")
 CASES = [case(f"{FILE}:RL839RamSwapped", ("RL839", "warning"), twin=f"{FILE}:Ram", pybullet=True, slow=True)]
 
 
