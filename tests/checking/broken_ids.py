@@ -25,6 +25,12 @@ MODEL = """<mujoco>
 class Biped(gym.Env):
     """Two legs; what it observes of contacts has noise."""
 
+    rlctl_ignore = {
+        "RL123": "this is about its contacts",
+        "RL609": "it has no goal",
+        "RL804": "it stretches its legs as far as they go",
+    }
+
     def __init__(self):
         self.model = mujoco.MjModel.from_xml_string(MODEL)
         self.data = mujoco.MjData(self.model)

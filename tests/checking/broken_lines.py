@@ -27,6 +27,8 @@ def to_matrix(q):
 class Kite(gym.Env):
     """It turns in all directions, keeps its state in a dictionary, and looks at a balloon."""
 
+    rlctl_ignore = {"RL609": "it has no goal"}
+
     size = 3
 
     def __init__(self):
@@ -75,29 +77,35 @@ class Kite(gym.Env):
         return self._get_obs(), float(facing), False, self.steps >= 60, {}
 
 
-class RL124KiteDown(Kite):
+class KiteDown(Kite):
     def gravity(self, matrix):
         return matrix @ GRAVITY
 
 
 class RL124KiteNorth(Kite):
+    rlctl_ignore = {**Kite.rlctl_ignore, "RL129": "it shows in what is observed, too"}
+
     def compass(self, matrix):
         return np.dot(matrix, self.north)
 
 
-class RL125KiteWay(Kite):
+class KiteWay(Kite):
     def way(self, matrix):
         to_balloon = self.balloon - self.state["pos"]
         return np.matmul(matrix, to_balloon)
 
 
 class RL124KiteLens(Kite):
+    rlctl_ignore = {**Kite.rlctl_ignore, "RL129": "it shows in what is observed, too"}
+
     def sight(self, matrix):
         return matrix.T @ LENS
 
 
 class Barge(gym.Env):
     """It turns in the plane; everything is written out by elements."""
+
+    rlctl_ignore = {"RL609": "it has no goal"}
 
     def __init__(self):
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -153,7 +161,7 @@ class Barge(gym.Env):
         return action[0], action[1], 0.5 * action[2]
 
 
-class RL125BargeWay(Barge):
+class BargeWay(Barge):
     def turn_way(self, v):
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
