@@ -34,6 +34,10 @@ these {count} rules. An **error** makes training wrong or impossible (exit code 
 A check that had no time for a quarter or more of the rules is no pass (exit code 1); its last line says which
 `--budget` should be enough.
 
+In some episodes it also notes what each expression of the environment's own source is worth, by copies of the
+functions' code, and lets conditions be true that rarely are. What is computed wrongly then shows also where it is not
+observed, and the finding names the line. The environment's files stay as they are.
+
 `--select RL3,RL501` checks only these rules, `--ignore RL106` skips a rule, `--explain RL304` prints one. If a finding
 is intended, waive its rule in the environment's class, with the reason:
 `rlctl_ignore = {{"RL604": "the fall is the goal"}}`. In a pull request, `--baseline FILE` reports only new findings; an

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rlctl import output
 from rlctl.checking.children import Supervisor
+from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
 from rlctl.checking.rules import (
@@ -273,6 +274,20 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 
 
 def _findings(rule: str, records: Records) -> list[RuleFinding]:
+    """Return the findings of a rule; those by expressions of the source only where it has found nothing else, and
+    experiments nothing for the rules that find the same."""
+    found: set[str] = {finding.rule for finding in records.findings}
+    by_expressions: list[RuleFinding] = records.facts.get(BY_EXPRESSIONS, [])
+    of_source = [one for one in by_expressions if one.rule == rule and not found & set(one.same)]
+    try:
+        return _find_played(rule, records) or of_source
+    except (NotJudged, NotApplicable):
+        if not of_source:
+            raise
+        return of_source
+
+
+def _find_played(rule: str, records: Records) -> list[RuleFinding]:
     judge_records, experiment = JUDGES.get(rule), DECIDED_BY.get(rule)
     findings = [finding for finding in records.findings if finding.rule == rule]
     if records.built is None and findings:

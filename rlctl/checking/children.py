@@ -113,10 +113,11 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
             if isinstance(message, RuleFinding):
                 with_finding.add(message.rule)
             yield message
-    except (NotJudged, NotApplicable) as reason:
+    except (NotJudged, NotApplicable, RecursionError) as reason:  # of the environment's calls it is `EnvironmentRaised`
+        why = TOO_DEEP if isinstance(reason, RecursionError) else str(reason)
         for name in (*experiment.rules, experiment.name):
             if name not in with_finding:
-                yield Skipped(name, str(reason), applies=isinstance(reason, NotJudged))
+                yield Skipped(name, why, applies=not isinstance(reason, NotApplicable))
     except EnvironmentRaised as error:
         is_complete = False
         yield describe_failure(error, context.progress)
@@ -134,6 +135,7 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
 
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
 FIRST_CALLS = 3.0  # So many times longer than others the first reset or step may take: it may compile or load
+TOO_DEEP = "an expression of its source is nested too deeply to be read"
 IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 
 

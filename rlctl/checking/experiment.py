@@ -61,6 +61,7 @@ class JudgeHook(Generic[Shown]):
 
     def __init__(self) -> None:
         self._parts: list[tuple[int, str, Callable[[Shown], Iterable[ChildMessage]]]] = []
+        self.rules: list[str] = []  # The ids of all that registered
         self.decided: list[str] = []  # The ids of the rules that the experiment decides if it completes
 
     def __call__(
@@ -70,6 +71,7 @@ class JudgeHook(Generic[Shown]):
 
         def register(part: Callable[[Shown], Iterable[ChildMessage]]) -> Callable[[Shown], Iterable[ChildMessage]]:
             self._parts.append((place, rule.id, part))
+            self.rules.append(rule.id)
             if decides:
                 self.decided.append(rule.id)
             return part

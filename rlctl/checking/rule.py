@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 
@@ -55,6 +55,7 @@ class RuleFinding:
     severity: Severity
     fix: str
     where: tuple[str, int] | None  # File and line of the code that causes it, where they are known
+    same: Collection[str]  # ids of rules: what an experiment has found for one of them shows this already
 
     def __init__(
         self,
@@ -64,11 +65,12 @@ class RuleFinding:
         severity: Severity | None = None,
         fix: str = "",
         where: tuple[str, int] | None = None,
+        same: Collection[str] = (),
     ) -> None:
         """Severity and fix are the rule's where left out."""
         self.rule, self.name, self.message, self.evidence = rule.id, rule.name, message, evidence or {}
         self.severity, self.fix = Severity(severity or rule.severity), fix or rule.fix
-        self.where = where
+        self.where, self.same = where, same
 
     def __str__(self) -> str:
         return f"{self.rule} {self.severity} ({self.name}): {self.message}"

@@ -11,10 +11,9 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+from rlctl.checking.assignments import list_assignments, list_values, read_converted
 from rlctl.checking.values import NUMBERS, find_author, list_own_classes
 
-CONVERSIONS = {"float", "float32", "float64", "item", "asarray", "array"}
-"""Functions that return what they are given."""
 DEEPEST = 6  # names and methods that are followed
 SHALLOW = 3  # the same, from a term to the action: what is further away is the robot, which the action moves
 LIMITS = {"clip", "fmax", "fmin", "heaviside", "max", "maximum", "min", "minimum", "relu", "where"}
@@ -68,14 +67,14 @@ class _TermSource:
                 return []  # a unit, or a name
             case ast.Constant(value=number):
                 return [float(number) if isinstance(number, NUMBERS) else UNKNOWN]
-            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=[only]) if name in CONVERSIONS:
-                return follow(only)
+            case ast.Call() if (inner := read_converted(value)) is not None:
+                return follow(inner)
             case ast.Call(func=ast.Attribute(value=ast.Name(id="self"), attr=name)):
                 method = next((one for _, one in self.methods if one.name == name), None)
                 returned = [node.value for node in ast.walk(method) if isinstance(node, ast.Return)] if method else []
                 return follow(returned[0], method) if method and len(returned) == 1 and returned[0] else [UNKNOWN]
             case ast.Name(id=name):
-                assigned = _find_assigned(function, name)
+                assigned = list_values(function, name)
                 if assigned:
                     return follow(assigned[0]) if len(assigned) == 1 else [UNKNOWN]
                 return [self._read_number(value)]
@@ -100,7 +99,7 @@ class _TermSource:
                 case ast.Name(id=name, ctx=ast.Load()) if name in {"action", "actions"}:
                     found = True
                 case ast.Name(id=name, ctx=ast.Load()):
-                    parts = [(assigned, function) for assigned in _find_assigned(function, name)]
+                    parts = [(assigned, function) for assigned in list_values(function, name)]
                 case ast.Attribute(value=ast.Name(id="self"), attr=name, ctx=ast.Load()):
                     parts = self._list_sources(name)
             for part, inside in parts if depth < SHALLOW else ():
@@ -114,12 +113,10 @@ class _TermSource:
         """Return what the methods assign to an attribute, and what a method of this name returns."""
         found: list[tuple[ast.expr, ast.FunctionDef]] = []
         for _, method in self.methods:
-            for node in ast.walk(method):
-                match node:
-                    case ast.Assign(targets=[ast.Attribute(value=ast.Name(id="self"), attr=attr)], value=assigned):
-                        found += [(assigned, method)] if attr == name else []
-                    case ast.Return(value=ast.expr() as returned) if method.name == name:
-                        found.append((returned, method))
+            several = [one for one in list_assignments(method) if ast.unparse(one.target) == f"self.{name}"]
+            found += [(one.value, method) for one in several if one.element is None and one.is_known]
+            returns = [node for node in ast.walk(method) if isinstance(node, ast.Return) and method.name == name]
+            found += [(node.value, method) for node in returns if node.value is not None]
         return found
 
     def _read_number(self, value: ast.expr) -> float:
@@ -206,13 +203,3 @@ def _read_entries(node: ast.AST) -> Iterator[tuple[str, ast.expr]]:
             for keyword in keywords:
                 if keyword.arg:
                     yield keyword.arg, keyword.value
-
-
-def _find_assigned(function: ast.FunctionDef, name: str) -> list[ast.expr]:
-    """Return what a function assigns to a local name."""
-    found = []
-    for node in ast.walk(function):
-        if isinstance(node, ast.Assign):
-            is_own = any(isinstance(target, ast.Name) and target.id == name for target in node.targets)
-            found += [node.value] if is_own else []
-    return found

@@ -102,6 +102,9 @@ Contacts = tuple[tuple[Any, ...], ...]
 ChangeContacts = Callable[[Sequence[Any], Contacts], Contacts]
 """Returns other contacts for bodyA, bodyB, linkIndexA, linkIndexB and the client of a call, None where left out."""
 
+AfterCall = Callable[[str, Sequence[Any], Mapping[str, Any], BulletCall], None]
+"""Takes the function, its arguments and keywords, and the place of a call."""
+
 
 def _read_contact_arguments(arguments: Sequence[Any], keywords: Mapping[str, Any]) -> tuple[Any, ...]:
     """Return bodyA, bodyB, linkIndexA and linkIndexB of a call; None where left out."""
@@ -125,6 +128,7 @@ class BulletCalls:
         self.search_paths: list[str] = []
         self.before_step: Callable[[int], None] | None = None  # called with the client before each stepSimulation
         self.after_step: Callable[[int], None] | None = None  # and after it
+        self.after_call: AfterCall | None = None  # called after each call
         self.change_contacts: ChangeContacts | None = None  # what getContactPoints gives the environment instead
         self.steps: collections.Counter[int] = collections.Counter()  # calls of stepSimulation by client
         self._known: set[tuple[CodeType, int]] = set()
@@ -284,6 +288,9 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
                 calls.steps[client] += 1
                 if calls.after_step is not None:
                     calls.after_step(client)
+            if calls.after_call is not None:
+                place = BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
+                calls.after_call(name, arguments, keywords, place)
             if name == "getContactPoints" and calls.change_contacts is not None:
                 asked = (*_read_contact_arguments(arguments, keywords), int(keywords.get("physicsClientId", 0)))
                 return calls.change_contacts(asked, result or ())

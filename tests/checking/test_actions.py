@@ -110,3 +110,7 @@ def test_random_actions_are_the_samples_of_the_space(space):
     space.seed(5)
     for _ in range(200):
         np.testing.assert_equal(next(drawn), space.sample(), strict=isinstance(space, spaces.Box))
+
+
+def test_a_gripper_that_has_nothing_to_grasp_is_an_info():
+    assert found("broken_actions.py:GrasperFarAway", "RL701") == {("RL701", "info")}

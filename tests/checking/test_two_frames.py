@@ -13,7 +13,12 @@ def broken(name, twin, **settings):
 
 
 CASES = [
-    broken("RL127AirshipGoal", "broken_substeps.py:Airship"),
+    case(
+        f"{FRAMES}:RL127AirshipGoal",
+        *[("RL125", "warning"), ("RL127", "warning")],  # the line that turns the goal, and what follows from it
+        twin="broken_substeps.py:Airship",
+        pybullet=True,
+    ),
     broken("RL127AirshipWind", f"{FRAMES}:AirshipInWorld", slow=True),
     broken("RL127FlyerSeesWind", f"{FRAMES}:FlyerSees", slow=True),
     broken("RL127PuckSeesWorld", f"{FRAMES}:PuckSees", slow=True),

@@ -34,6 +34,7 @@ from typing import TypeVar
 
 from rlctl.checking import experiments
 from rlctl.checking.experiment import HASH_SEEDS, Experiment, RecordsJudge
+from rlctl.checking.experiments.expressions import judges_expressions, note_expressions
 from rlctl.checking.rule import Rule
 from rlctl.errors import UsageError, did_you_mean
 
@@ -93,7 +94,8 @@ PROCESSES = {
 def find_needs(rules: Collection[str]) -> set[str]:
     """Return the names of the experiments that some rules need."""
     judged = {name for rule in rules if rule in JUDGES for name in JUDGES[rule].needs}
-    return judged | {DECIDED_BY[rule].name for rule in rules if rule in DECIDED_BY}
+    noted = {note_expressions.name} if set(rules) & set(judges_expressions.rules) else set()
+    return judged | noted | {DECIDED_BY[rule].name for rule in rules if rule in DECIDED_BY}
 
 
 def find_rules(experiments: Collection[str]) -> list[str]:

@@ -9,10 +9,10 @@ from rlctl.checking.action_trials import REWARD, Frame, Trials, find_differences
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
+from rlctl.checking.previous_values import is_previous_key
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, OutOfTime, Rule, RuleFinding, Severity
 from rlctl.checking.rules.rl637_progress_is_counted_from_the_start import RULE as FROM_START
-from rlctl.checking.rules.rl637_progress_is_counted_from_the_start import is_previous
 from rlctl.checking.values import Attribute, find_assignment, find_unequal, flatten, read_attributes
 
 RULE = Rule(
@@ -49,7 +49,7 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
             frames = _play_changed(instance, trials, name, other)
             if frames is None or not _hides(plain, frames):
                 continue
-            if is_previous(name):
+            if is_previous_key(name):
                 yield _count_from_start(instance, name, plain, frames)
             elif _is_shown(instance, name):
                 continue

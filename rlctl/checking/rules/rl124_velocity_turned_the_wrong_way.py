@@ -1,16 +1,18 @@
 """RL124: velocity turned the wrong way."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking import attitudes
+from rlctl.checking import attitudes, wrong_turns
 from rlctl.checking.body_frames import BodyFrame, find_body_frames
 from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.fixed_directions import find_turned_directions, list_body_turns
 from rlctl.checking.readings import NEARLY_ALL
@@ -25,12 +27,14 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Three elements of the observation are the velocity of a free body, turned by its orientation in the wrong
-        direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both
-        velocities of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its
-        angular velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction
-        that reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an
-        engine is read from its attributes: its velocity is what changes its position, its frame the one in which its
-        actions push it, or the orientation that its angular velocity turns.
+        direction or twice: they are neither in the world's frame nor in that of the body. In PyBullet both velocities
+        of a base are in the world's frame. In MuJoCo the velocity of a free joint is, qvel[0:3], and its angular
+        velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction that
+        reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an engine is
+        read from its attributes: its velocity is what changes its position, its frame the one in which its actions
+        push it, or the orientation that its angular velocity turns. Or a line of the source does so: it turns a
+        vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse, with a
+        way in the world.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
@@ -68,9 +72,15 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 @judges_records(RULE, "worlds", "attributes")
 def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
-    yield from find_wrong_turns(log)
+    if log is not None and not np.isfinite(log.physics_s):  # an engine tells more
+        yield from find_wrong_turns(log)
+
+
+@judges_expressions(RULE, decides=False)
+def _find_wrong_turns_of_lines(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    mixed = wrong_turns.find_mixed_frames(RULE, noted.turned)
+    found = itertools.chain(mixed, wrong_turns.find_wrong_turns(RULE, noted.turned, of_ways=False))
+    yield from itertools.islice(found, 1)
 
 
 def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:

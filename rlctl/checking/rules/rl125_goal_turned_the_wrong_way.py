@@ -1,6 +1,7 @@
 """RL125: goal turned the wrong way."""
 
 import collections
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from rlctl.checking import attitudes
 from rlctl.checking.bullet_worlds import read_poses, read_world
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.instance import Instance
@@ -15,6 +17,7 @@ from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
+from rlctl.checking.wrong_turns import find_wrong_turns
 from rlctl.environments.info import find_mujoco
 
 RULE = Rule(
@@ -23,8 +26,9 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         The observation has the way to a goal, turned by the orientation of a body, or by its yaw, in the wrong
-        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how
-        it is turned. A policy that does not see the heading too cannot learn where the goal is.
+        direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how it
+        is turned, or a line of the source turns the way by the orientation itself. A policy that does not see the
+        heading too cannot learn where the goal is.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v); by a yaw
@@ -42,6 +46,11 @@ class _Frame(NamedTuple):
     name: str
     client: int
     link: Link
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_wrong_turns(RULE, noted.turned, of_ways=True), 1)
 
 
 @judges_goals(RULE)

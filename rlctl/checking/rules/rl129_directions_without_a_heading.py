@@ -6,7 +6,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.rotated import RotatedRobot, judges_rotated
+from rlctl.checking.observed_frames import find_world_vectors
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.transitions import name_floats
@@ -21,9 +23,10 @@ RULE = Rule(
         angles, or, of a robot on a vertical hinge, the hinge and what is free. What is observed in the frame of the
         robot stays the same then. Some elements turn, so they are in the axes of the world, and nothing of the
         observation shows the heading: a policy cannot know in which direction of the robot they point. Or all of the
-        observation stays the same, and the reward is another one. Or elements turn twice as far: they are turned in the
-        wrong direction. An info where all episodes begin with nearly the same
-        heading: then the policy only loses its way as it turns.
+        observation stays the same, and the reward is another one. Or elements turn twice as far: they are turned in
+        the wrong direction. Or the source puts a vector of the world into the observation next to one that it turns
+        into the frame of the robot. An info where all episodes begin with nearly the same heading: then the policy
+        only loses its way as it turns.
     """,
     fix="""
         Turn the vectors into the frame of the robot, x' = cos(yaw) x + sin(yaw) y and y' = cos(yaw) y - sin(yaw) x, or
@@ -39,6 +42,11 @@ TURN_ERROR = 0.1  # part of the length of a vector
 SAME_DIRECTION = 0.9  # length of the mean of unit vectors
 MATTERS = 0.25  # part of what rewards differ by in episodes that are not turned
 TINY = 1e-4  # of rewards
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_world_vectors(RULE, noted.turned, noted.definitions), 1)
 
 
 @judges_rotated(RULE)

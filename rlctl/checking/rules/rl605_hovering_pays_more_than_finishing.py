@@ -1,5 +1,6 @@
 """RL605: hovering pays more than finishing."""
 
+import ast
 import dataclasses
 from collections.abc import Iterator, Sequence
 
@@ -9,11 +10,14 @@ from rlctl.checking import rewards
 from rlctl.checking.drawn_goals import Numbers, Source
 from rlctl.checking.episode import zero_action
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
 from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
+from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.paid_successes import SuccessReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
-from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 
 RULE = Rule(
     "RL605",
@@ -24,7 +28,9 @@ RULE = Rule(
         staying there earns more than finishing, so the policy learns to hover. rlctl repeated an episode that
         finished, and stopped shortly before its end; or every recorded success pays less than the steps would
         have paid that were left, by what episodes without a success earn. Or the check moved the goal: next to the
-        robot, which rests or which the goal accompanies, each step pays, and a success ends that for less.
+        robot, which rests or which the goal accompanies, each step pays, and a success ends that for less. The
+        same is read in the source: what its terms pay at the goal, and what success adds, or replaces them by; and a
+        step with success set to true pays less than without it, with the goal as near.
     """,
     fix="""
         Pay for finishing at least what staying near the goal would earn to the end of the episode, pay for
@@ -41,6 +47,8 @@ MOST_LOST = 0.5  # times as much as success, discounted, where the undiscounted 
 LATE = 10  # steps after the recorded ones are assumed to earn the mean of the last so many rewards
 
 
+IN_SOURCE = "incomes in the source"
+"""The fact with what each step pays next to the goal, what success pays, and whether time is paid."""
 NEAR_GOAL = "near the goal"
 """The fact of an `Income`."""
 FIRST_STEPS, RESTING_STEPS = 15, 12  # with the goal that reset drew, in which robots settle; and next to the robot
@@ -59,10 +67,16 @@ class Income:
     success: float
 
 
-@judges_records(RULE, *rewards.WITH_SEARCH, "goals")
+@judges_records(RULE, *rewards.WITH_SEARCH, "goals", "expressions")
 def _compare_incomes(records: Records) -> Iterator[RuleFinding]:
-    found = list(_compare_successes(records))
-    yield from found or _compare_with_moved_goal(records)
+    in_source = list(_compare_in_source(records))
+    try:
+        found = list(_compare_successes(records)) or list(_compare_with_moved_goal(records))
+    except (NotApplicable, NotJudged):
+        if not in_source:
+            raise
+        found = []
+    yield from found or in_source
 
 
 def _compare_with_moved_goal(records: Records) -> Iterator[RuleFinding]:
@@ -75,15 +89,20 @@ def _compare_with_moved_goal(records: Records) -> Iterator[RuleFinding]:
     hovering = rewards.discounted_steps(least.per_step, longest - FIRST_STEPS)
     whole = least.per_step * (longest - FIRST_STEPS)
     paid = max(one.success for one in incomes)
-    is_more = hovering > FAR_MORE * max(paid, 0.0)
-    # Long episodes may not be discounted so much, and evaluations are not discounted at all.
-    if not is_more and not (whole > FAR_MORE * max(paid, 0.0) and hovering > MOST_LOST * paid):
+    if not _is_worth_more(hovering, whole, paid):
         return
     staying = f"staying {least.distance:.3g} from the goal pays {least.per_step:.3g} in each step"
     message = f"success ends the episode and pays {paid:.4g}; {staying}, {whole:.4g} until step {longest}"
     message += f", or {hovering:.4g} with a discount of {rewards.DISCOUNT}"
     evidence = {"seed": least.seed, "value": hovering, "expected": f"below {paid:.6g}", "per_step": least.per_step}
     yield RuleFinding(RULE, message, evidence)
+
+
+def _is_worth_more(hovering: float, whole: float, paid: float) -> bool:
+    """Say whether staying is worth far more than a success, discounted, or also undiscounted."""
+    # Long episodes may not be discounted so much, and evaluations are not discounted at all.
+    is_more = hovering > FAR_MORE * max(paid, 0.0)
+    return is_more or (whole > FAR_MORE * max(paid, 0.0) and hovering > MOST_LOST * paid)
 
 
 @judges_goals(RULE, decides=False)
@@ -239,3 +258,40 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
         message = f"{finishing}; stopping there earns {more}"
         earned = {"value": best.stopping, "expected": f"below {best.finishing:.6g}", "per_step": best.per_step}
         yield RuleFinding(RULE, message, finished.at(best.step, **earned))
+
+
+@judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
+def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Read what the source pays for success, and what it pays in each step next to the goal."""
+    reader = GoalReader(notes)
+    for summand, number, income in reader.find_replaced():
+        message = f"success replaces the reward by {number:.4g}, and a step next to the goal pays up to {income:.4g}"
+        evidence = {"value": number, "expected": f"above {income:.4g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
+        return
+    low = SuccessReader(reader).find()
+    if low is not None:
+        message = (
+            f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
+        )
+        message += f" {low.before:.4g}" + (f", where only {low.lacks} is not true" if low.lacks else "")
+        evidence = {"value": low.success, "expected": f"above {low.before:.4g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(low.paid))
+        return
+    income, bonus = reader.read_income(), reader.read_bonus()
+    if bonus is not None and income > 0 and reader.ends_at_success():
+        yield Fact(IN_SOURCE, (income, bonus, reader.pays_for_time()))
+
+
+def _compare_in_source(records: Records) -> Iterator[RuleFinding]:
+    if IN_SOURCE not in records.facts:
+        return
+    income, bonus, pays_for_time = records.facts[IN_SOURCE]
+    steps = [one.steps for one in records.trajectories]
+    longest = records.require_built().max_steps or max(steps, default=0)
+    staying, whole = rewards.discounted_steps(income, longest), income * longest
+    if _is_worth_more(staying, whole, bonus) or (pays_for_time and whole > bonus):
+        message = f"success ends the episode and pays {bonus:.4g}; in the source, each step next to the goal pays"
+        message += f" {income:.3g} or more, {whole:.4g} in {longest} steps, or {staying:.4g} with a discount of"
+        message += f" {rewards.DISCOUNT}"
+        yield RuleFinding(RULE, message, {"value": staying, "expected": f"below {bonus:.6g}", "per_step": income})

@@ -6,6 +6,8 @@ import numpy as np
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import ACTION_TERMS, WEIGHED_TERMS
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     ENOUGH_STEPS,
@@ -24,16 +26,26 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A reward term that is named after the actions, their change, or the effort of the motors, or that its
-        source computes from the action without a limit, is exactly 0 at every recorded step, although the
-        actions changed. It costs nothing, so nothing keeps the motions smooth or cheap. Terms whose name says
+        source computes from the action without a limit, is exactly 0 at every recorded step, although the actions
+        changed. It costs nothing, so nothing keeps the motions smooth or cheap. Terms whose name says
         that only a part counts, such as excess_torque, are not judged. An info in a plain environment, unless
-        its source multiplies the term by a known number other than 0.
+        its source multiplies the term by a known number other than 0. So is a difference in the source between a
+        value and what an attribute has kept of it, such as action - self.last_action, that is 0 in each step
+        although the value changes, and that is paid.
     """,
     fix="""
         Look at what the term is computed from. An action must not be compared with itself: keep a copy of the last
         one, and replace it after the reward. PyBullet reports no torque of joints in TORQUE_CONTROL.
     """,
 )
+
+
+@judges_expressions(RULE, decides=False)
+def _find_zero_differences(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    for one in KeptDifferences(noted).find_always_zero():
+        message = f"{one.whole.text} is 0 in all {len(noted.steps)} steps, although {one.new.text} changes:"
+        message += f" {one.key} has been replaced by it before"
+        yield RuleFinding(RULE, message, {"term": one.whole.text, "value": 0.0}, where=one.whole.where)
 
 
 @judges_records(RULE, *WITH_SEARCH, "attributes", of_absence=True)

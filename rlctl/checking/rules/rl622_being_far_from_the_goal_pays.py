@@ -1,5 +1,6 @@
 """RL622: being far from the goal pays."""
 
+import ast
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -8,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_episodes import GoalEpisode, GoalTrials
 from rlctl.checking.leaving import Leaving, find_leaving
+from rlctl.checking.paid_distances import RiseReader
+from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.reward_peaks import Peak, find_peaks
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
@@ -24,10 +28,12 @@ RULE = Rule(
         success, which goes on; or a goal that goes away pays more than one that comes nearer; or the reward rises
         through the goal and beyond, as a sum of differences with their signs does; or it rises as the robot goes
         away from the object that it has to bring to the goal; or it is highest with the goal somewhere else than where
-        it is a success. The check played
-        the same steps again, and put the goal, or the command, where is_success is true, and at several
-        distances from there. So the policy learns to keep away from the goal. Most often a sign is wrong, or an
-        error is paid instead of a function that falls with it, or differences are added instead of their sizes.
+        it is a success. The check played the same steps again, and put the goal, or the command, where is_success is
+        true, and at several distances from there. The source is read, too: a function that falls with a distance is
+        subtracted, a distance to a goal is added, or what it has grown by in the step; and where the source computes a
+        distance to a goal or to an object, it is set to several values, and the same step pays more for larger ones.
+        So the policy learns to keep away from the goal. Most often a sign is wrong, or an error is paid instead of a
+        function that falls with it, or differences are added instead of their sizes.
     """,
     fix="""
         Make the reward largest where the task is done: subtract the distance or the error, pay
@@ -356,3 +362,23 @@ def _exceeds(rewards: Sequence[float], inside: _Outcome) -> bool:
     """Say whether failures pay more than a success that does not end the episode."""
     least = LEAST * max(1.0, *map(abs, rewards))
     return not inside.has_ended and min(rewards) > inside.reward + least
+
+
+@judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
+def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Yield the first summand of the reward whose sign pays for a distance."""
+    reader = GoalReader(notes)
+    for paid in reader.find_wrong_signs():
+        text, weight = ast.unparse(paid.place.node), paid.summand.weight
+        message = f"{paid.how} in the source of the reward: {text} counts {weight:+.4g} times"
+        yield RuleFinding(RULE, message, {"element": paid.summand.name}, where=notes.reward.locate(paid.place))
+        return
+    for rise in RiseReader(reader).find_rises():
+        (close, near), (away, far) = rise.near, rise.far
+        message = (
+            f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"
+        )
+        message += f" the same steps pay {near:.4g} where it is {close:.3g}, and {far:.4g} where it is {away:.3g}"
+        evidence = {"element": rise.name, "value": far, "expected": f"below {near:.6g}"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(rise.place))
+        return

@@ -5,8 +5,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import NEAR, judges_goals
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
+from rlctl.checking.goal_places import find_two_places
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.transitions import find_float_leaves
@@ -22,13 +24,23 @@ RULE = Rule(
         neighbour, or what was meant is the tip, and what is read is the body that carries it. The same of an
         object: its way to the goal is observed, or it is the achieved_goal, and success is where the hand is; or
         what is observed as its way is not 0 where it is at the goal, as with the goal in the world and the object
-        in the robot's frame.
+        in the robot's frame. Or the source compares the goal with two places that are always the same way apart: one
+        of them is in another frame, or another point of the same body.
     """,
     fix="Use the same link, and the same point of it, in the observation, in the reward and for success.",
 )
 
 EPISODES = 3
 MOVED, SAME_WAY = 0.02, 0.1  # how far an object is shifted [m], and the part by which what is observed may differ
+
+
+@judges_expressions(RULE, decides=False)
+def _find_places_apart(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    for one, other in find_two_places(noted):
+        apart = [float(number) for number in np.round(one.values[0] - other.values[0], 4) + 0.0]
+        message = f"{one.whole.text} and {other.whole.text} (line {other.whole.where[1]}) compare {one.goal} with two"
+        message += f" places that are always {apart} apart, although both move"
+        yield RuleFinding(RULE, message, {"element": one.name, "value": apart}, where=one.whole.where)
 
 
 @judges_goals(RULE)

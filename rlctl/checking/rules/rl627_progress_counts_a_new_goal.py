@@ -6,8 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
+from rlctl.checking.goal_draws import GoalDraws
 from rlctl.checking.goal_episodes import HELD_STEPS, PLACED_STEPS, GoalEpisode, GoalTrials
+from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -19,7 +22,9 @@ RULE = Rule(
         The reward pays progress, the distance before minus the distance now, and where a goal is reached and the next
         one is drawn, the distance before is still that to the old goal. The first step towards the new goal is paid as
         if the robot had been carried away by the whole way between both: the more goals it reaches, the more it loses.
-        The check put the goal at the robot, so that the environment went on to the next one.
+        The check put the goal at the robot, so that the environment went on to the next one; or it let the condition in
+        the source be true under which the next goal comes, and the difference to the value before then jumped, in that
+        step or in the next one.
     """,
     fix="Compute the distance to the new goal where the goal changes, and keep that as the distance before.",
 )
@@ -39,6 +44,18 @@ class _Switch(NamedTuple):
     turn: float  # and the angle to it, where a goal is a pose [rad]
     jump: float  # of the reward against the steps that follow
     noise: float  # how far these differ
+
+
+@judges_expressions(RULE, decides=False)
+def _find_jumps(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    for one in GoalDraws(KeptDifferences(noted)).find_jumps():
+        difference = one.difference
+        when = f"in which {one.key} changes" if one.at_once else f"after {one.key} has changed"
+        message = f"in the step {when}, {difference.whole.text} is up to {one.jump:.3g}, and at most"
+        message += f" {one.usual:.3g} in nearly all other steps: {difference.key} is not computed again for the"
+        message += f" new {one.key}, which comes if {one.test}; tried in {one.episodes} episodes"
+        evidence = {"element": one.key, "value": one.jump, "expected": one.usual}
+        yield RuleFinding(RULE, message, evidence, where=difference.whole.where)
 
 
 @judges_goals(RULE)

@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import EPISODES, AttributeLog, Numbers
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.feet import find_feet, read_touches
+from rlctl.checking.first_contacts import find_endless_landings
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.step_times import find_rates
@@ -24,7 +26,8 @@ RULE = Rule(
         foot on the ground earns it, or the term has a value where it should be zero, such as exp(0). Standing still
         then earns it in every step, and the robot need not walk. The check gave the zero action until the robot stood
         or lay still, in several episodes. A term of any name is found that pays each landing otherwise, and for each
-        foot that stays on the ground the same: each step of contact counts as a landing.
+        foot that stays on the ground the same: each step of contact counts as a landing. So is a condition in the
+        source such as contact & (self.air_time > 0), where the time is counted on before.
     """,
     fix="""
         Pay the clearance only of feet that move, such as height error times the foot's horizontal speed, and the time
@@ -42,6 +45,14 @@ FEWEST_STAYS, FEWEST_LANDINGS = 30, 6  # steps
 ALIKE, ALIKE_FLIGHTS = 0.75, 0.9  # parts of the steps in which feet stay, or none touches, that pay each the same
 EXACT = 1e-6  # relative error of what is paid
 FEWEST_VALUES = 3  # different ones, of what landings pay
+
+
+@judges_expressions(RULE, decides=False)
+def _find_landings(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    for one in find_endless_landings(noted):
+        message = f"{one.text} holds in all {one.stays} steps in which a contact goes on, since {one.key} has been"
+        message += f" counted on to {one.time:.3g} before: each step on the ground counts as a landing"
+        yield RuleFinding(RULE, message, {"element": one.key, "value": one.time}, where=one.where)
 
 
 @judges_records(RULE, "attributes")

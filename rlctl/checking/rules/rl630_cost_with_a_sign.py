@@ -6,11 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from rlctl.checking.assignments import CONVERSIONS
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.paid_errors import ErrorReader
 from rlctl.checking.records import CheckedEpisode, ChildMessage, Records
 from rlctl.checking.rewards import RAW_TERMS, TERMS, WITH_SEARCH, find_terms, has_terms, require_rewarded
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.signed_costs import SignedCostReader
 from rlctl.checking.term_names import is_about_actions, is_cost, is_error, split_name
 from rlctl.checking.term_weights import list_methods
 from rlctl.checking.transitions import find_float_leaves
@@ -25,7 +29,9 @@ RULE = Rule(
         A cost is the sum of actions, or of elements of the observation, with their signs: where they are negative it
         pays. The policy learns full reverse, or to swing to one side. Judged are terms in info['reward_terms'] that are
         such a sum in all steps and are named after a cost, or have a negative weight in a task; and lines of step that
-        subtract the plain sum of the action from the reward, where the action may be negative.
+        subtract the plain sum of the action from the reward, where the action may be negative, or any sum whose
+        numbers, and which itself, had both signs; or one number that has both, such as the sine of a tilt or a velocity
+        to the side.
     """,
     fix="Sum squares or sizes: np.sum(np.square(action)), or np.sum(np.abs(action)).",
 )
@@ -36,7 +42,6 @@ EXACT = 1e-4  # of the term's size
 BOTH = 0.05  # part of the largest size that a term has on either side of 0
 FEWEST_STEPS, MOST_STEPS = 50, 2_000
 SUMS = {"sum", "mean", "nansum", "nanmean", "average"}
-CONVERSIONS = {"clip", "asarray", "array", "float32", "float64", "astype", "copy", "ravel", "flatten", "clamp"}
 ACTION_NAMES = {"action", "actions", "act", "a", "u", "ctrl", "control", "controls"}
 REWARD_WORDS = {"reward", "rewards", "rew"}
 
@@ -150,7 +155,7 @@ def _only_converts(value: Any) -> bool:
     match value:
         case ast.Name():
             return True
-        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in CONVERSIONS:
+        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name)) if name in {*CONVERSIONS, "clamp", "clip"}:
             inner = [value.func.value] if isinstance(value.func, ast.Attribute) else []
             inner = [one for one in inner if not isinstance(one, ast.Name)]
             return all(_only_converts(one) for one in [*inner, *value.args[:1]])
@@ -187,3 +192,22 @@ def _is_sum(value: ast.expr, names: set[str]) -> bool:
         case ast.Call(func=ast.Name(id="float"), args=[only]):
             return _is_sum(only, names)
     return False
+
+
+@judges_expressions(RULE, decides=False)
+def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Yield the first cost of the source that is a sum with signs, by what it was worth."""
+    for summand, place in ErrorReader(notes).find_sums():
+        paid = summand.weight * notes.reward.numbers.list_values(place.node)
+        message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} adds up numbers with their"
+        message += f" signs: it costs up to {-paid.min():.4g} and pays up to {paid.max():.4g}"
+        evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(place))
+        return
+    for summand, place in SignedCostReader(notes).find():
+        paid = summand.weight * notes.reward.numbers.list_values(summand.place.node)
+        message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} has a sign: it costs up to"
+        message += f" {-paid.min():.4g} and pays up to {paid.max():.4g}"
+        evidence = {"term": summand.name, "value": float(paid.max()), "expected": "at most 0"}
+        yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
+        return

@@ -1,11 +1,15 @@
 """RL633: direction of the command is not paid."""
 
+import ast
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rlctl.checking.command_sizes import SizeReader
 from rlctl.checking.drawn_goals import DrawnPlace, Numbers
 from rlctl.checking.experiments.commands import LATER_STEPS, CommandTrials, judges_commands
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.paid_commands import CommandReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -17,7 +21,8 @@ RULE = Rule(
         The reward follows how large a command is, and not in which direction it points: the check played the same
         steps with the command turned back, and to the sides, and each reward was the same, while it changes with the
         length of the command. So driving in any direction at the commanded speed is paid in full. Most often two
-        lengths are compared, |v| with |command|.
+        lengths are compared, |v| with |command|, which is also read in the source; or a command that has both signs
+        with a number that is never negative, so that half of the commands cannot be met.
     """,
     fix="Take the length of the difference: np.linalg.norm(velocity - command), and not the difference of the lengths.",
 )
@@ -95,3 +100,20 @@ def _pay(trials: CommandTrials, place: DrawnPlace, seed: int, command: Numbers) 
         if len(rewards) == LATER_STEPS:
             return rewards[-1]
     return np.nan
+
+
+@judges_expressions(RULE, decides=False)
+def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Yield the first difference of lengths in the source of the reward."""
+    for summand, place in CommandReader(notes).find_lengths():
+        message = f"reward term {summand.name!r} compares lengths only, and nothing compares the direction:"
+        message += f" {ast.unparse(place.node)}"
+        yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(place))
+        return
+    for one in SizeReader(notes).find_one_sided():
+        message = (
+            f"reward term {one.summand.name!r} compares a command that has both signs with {ast.unparse(one.size)},"
+        )
+        message += f" which is never negative: {ast.unparse(one.place.node)}"
+        yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
+        return

@@ -8,6 +8,8 @@ import numpy as np
 from rlctl.checking.command_sweeps import Array, CommandSweep
 from rlctl.checking.drawn_goals import DrawnPlace
 from rlctl.checking.experiments.commands import MOTION_WORDS, CommandTrials, judges_commands
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.paid_commands import CommandReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.term_names import split_name
@@ -21,7 +23,8 @@ RULE = Rule(
         motion of the base that such a command does not mean: the rate about a level axis, while no number of the
         command is compared with the rate about the vertical; the speed to the side, while the second number is
         compared with the speed ahead; the rate in degrees for a command in radians; or the rate with the other sign
-        than the observation has it. Moving as commanded is not paid.
+        than the observation has it. Or the source compares a number of a velocity along one axis with what is named
+        after another, such as yaw_error = command[1] - gyro[0]. Moving as commanded is not paid.
     """,
     fix="""
         Compare each number of the command with its own quantity: forward speed with velocity[0], speed to the side
@@ -174,3 +177,14 @@ def _find_swapped(place: DrawnPlace, motions: dict[DrawnPlace, _Motions]) -> str
 
 def _differs(found: _Motions, motion: Array) -> bool:
     return bool(np.abs(found.best - motion).max() > 10 * found.error)
+
+
+@judges_expressions(RULE, decides=False)
+def _find_other_axis(notes: NotedEpisodes) -> Iterator[ChildMessage]:
+    """Yield the first number of a velocity along another axis than the names say."""
+    for summand, named, text, axis in CommandReader(notes).find_other_axes():
+        message = (
+            f"reward term {summand.name!r} compares {text} with what is called {named!r}, which is about axis {axis}"
+        )
+        yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(summand.place))
+        return

@@ -9,9 +9,13 @@ from numpy.typing import NDArray
 
 from rlctl.checking.action_trials import REWARD, Frame, Trials
 from rlctl.checking.experiment import INSTANCES, experiment
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.goal_draws import GoalDraws
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
+from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.stale_values import StaleValues
 from rlctl.checking.term_names import is_place
 from rlctl.checking.values import Attribute, find_unequal, read_attributes, shape_like
 
@@ -23,7 +27,9 @@ RULE = Rule(
         reset draws several goals, one after the other, and for a while the observation shows one of them and the
         reward pays for another: a policy that does what it sees earns nothing. One goal after the other was replaced
         while the same episode was played: in the same steps only one of them changed the observations, and only
-        another one changed the rewards.
+        another one changed the rewards. Or reset copies a goal or a command into another attribute, and steps still
+        read the copy after another one was drawn: the check let the condition be true under which that happens. Or only
+        the first reset computes a value, as under `if self.goal is None`, from another one that each reset sets anew.
     """,
     fix="Choose the goal in one place, which the observation, the reward and the success read.",
 )
@@ -32,6 +38,19 @@ MOST_GOALS, MOST_GROUPS = 6, 3
 LONGEST = 400  # steps of an episode that are compared
 FEWEST = 10  # steps in a row; a reward may belong to the goal that was seen before the step
 SAME = 1e-6  # differences that do not count, of the numbers or of 1
+
+
+@judges_expressions(RULE, decides=False)
+def _find_stale_copies(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    stale = StaleValues(GoalDraws(KeptDifferences(noted)))
+    for one in stale.find_stale_copies():
+        message = f"reset copies {one.goal} into {one.copy}, which steps still read after {one.goal} has changed:"
+        message += f" {one.read.text} is then that of the last {one.goal}"
+        yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
+    for one in stale.find_first_only():
+        message = f"only the first reset computes {one.copy} from {one.goal}, and each reset sets {one.goal} anew:"
+        message += f" {one.read.text} is that of the first episode"
+        yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
 
 
 @dataclasses.dataclass(frozen=True)

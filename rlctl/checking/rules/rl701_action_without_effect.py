@@ -1,25 +1,34 @@
 """RL701: action without effect."""
 
+import ast
+import itertools
 from collections.abc import Iterator, Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
+
+import numpy as np
 
 from rlctl.checking import action_trials
 from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
+from rlctl.checking.assignments import list_values
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import OutOfTime, Rule, RuleFinding, Severity, list_names
+from rlctl.checking.term_weights import list_methods
+from rlctl.checking.unread_actions import find_unread_elements
+from rlctl.checking.values import find_author
 
 RULE = Rule(
     "RL701",
     "action without effect",
     Severity.WARNING,
     meaning="""
-        An element of the action was set to its lowest and to its highest value, and the episode stayed the same
-        to the last bit. Noise on such an element only costs exploration. An element that only changes the
-        reward of its own step (a cost) or its own copy in the observation moves nothing either. An error if no
-        element does anything else: there is nothing to learn. An info if the reward of the own step can also
-        rise, as in a bandit, or if all values in one half of the range do the same; a warning where that is so for
-        every element.
+        An element of the action was set to its lowest and to its highest value, and the episode stayed the same to the
+        last bit. Noise on such an element only costs exploration. An element that only changes the reward of its own
+        step (a cost) or its own copy in the observation moves nothing either. Or the source reads one element in two
+        statements and never the one beside it. An error if no element does anything else: there is nothing to learn. An
+        info if the reward of the own step can also rise, as in a bandit, if the source compares the element, as that of
+        a gripper, or if all values in one half of the range do the same; a warning where that is so for every element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
@@ -32,11 +41,19 @@ WHOLE_RANGE = (
     "part of the action without effect. If the motor acts in one direction only, declare the range from 0 to 1."
 )
 MOST_DIMENSIONS = 64
+ACTION_NAMES = {"a", "action", "actions", "act", "u", "cmd", "command", "ctrl"}
 STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
 LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
 Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 """Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
 in the observation; or nothing."""
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    shape = getattr(noted.instance.env.action_space, "shape", None)
+    size = int(np.prod(shape or 0))
+    yield from itertools.islice(find_unread_elements(RULE, noted.source, noted.of_steps, size), 1)
 
 
 @judges_actions(RULE)
@@ -57,12 +74,36 @@ def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
         if not effects:
             raise
     left_out = f" ({len(effects)} of {len(every)} dimensions: {why})" if why else ""
+    switches = _list_switches(trials.instance.env)
+    waiting = [name for name, effect in effects.items() if effect == "none" and name in switches]
+    if waiting and len(waiting) < len(effects):
+        effects = {name: effect for name, effect in effects.items() if name not in waiting}
+        message = (
+            f"{list_names(waiting)} changed nothing over {STAGES[-1][1]} steps from two seeds: the source compares"
+        )
+        yield _finding(waiting, f"{message} it, and what follows may need a place that was not reached", Severity.INFO)
     yield from _without_effect(effects, len(every), left_out)
     if halves:
         message = f"half of the range is dead, every value there has the same effect: {list_names(halves)}"
         # A single motor may act in one direction only. That all do is what a clip to the wrong range leaves.
         is_all = len(halves) == len(every) > 1
         yield _finding(halves, message, Severity.WARNING if is_all else Severity.INFO, fix=WHOLE_RANGE)
+
+
+def _list_switches(env: Any) -> set[str]:
+    """Return the elements of the action that the source compares, as a gripper's or a suction cup's: `action[3] > 0`,
+    also by another name. They act only where there is something to grasp."""
+    found: set[str] = set()
+    for _, function in list_methods(find_author(env)):
+        compared = [node.left for node in ast.walk(function) if isinstance(node, ast.Compare)]
+        named = [part for node in compared if isinstance(node, ast.Name) for part in list_values(function, node.id)]
+        for node in [*compared, *named]:
+            match node:
+                case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=int(index))) if (
+                    name in ACTION_NAMES
+                ):
+                    found.add(f"action[{index}]")
+    return found
 
 
 def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:

@@ -18,6 +18,7 @@ from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity, list_others
 from rlctl.checking.step_times import StepTimes, require_step_times
 from rlctl.checking.term_names import split_name
+from rlctl.checking.timed_expressions import Use, find_wrong_time
 from rlctl.checking.told_speeds import (
     ToldSpeed,
     find_told_speeds,
@@ -33,12 +34,13 @@ RULE = Rule(
     "velocity over the wrong time",
     Severity.WARNING,
     meaning="""
-        An element of the observation is how far something moved in a whole step of the environment, divided by
-        the time of one step of the physics; or several are, turned into some frame; or a number of info is, such as the
-        speed that is paid, or a term of the reward. The velocity is too large by
-        the number of physics steps, and a controller of the real robot that measures it right gives the policy
-        something else. So it is where the change is not divided by any time, and a name or other elements say that
-        velocities are meant; otherwise that is an info. Objects that nobody moved are thrown to see it.
+        An element of the observation is how far something moved in a whole step of the environment, divided by the time
+        of one step of the physics; or several are, turned into some frame; or a number of info is, such as the speed
+        that is paid, or a term of the reward; or a line of the source divides so what changes in a whole step. The
+        velocity is too large by the number of physics steps, and a controller of the real robot that measures it right
+        gives the policy something else. So it is where the change is not divided by any time, and a name or other
+        elements say that velocities are meant; otherwise that is an info. Objects that nobody moved are thrown to see
+        it.
     """,
     fix="""
         Divide by the time between two actions, self.dt of a MujocoEnv, which is model.opt.timestep *
@@ -85,7 +87,19 @@ def _find_told(one: ObservedWorld, changes: "_Changes", watched: WatchedWorlds) 
         return
 
 
-@judges_records(RULE, "worlds", "attributes")
+@judges_records(RULE, "worlds", "attributes", "expressions")
+def _judge_records(records: Records) -> Iterator[RuleFinding]:
+    for timed, times in find_wrong_time(records, Use.DIVIDED):
+        message = f"{timed.text} divides the change of a whole step by {timed.seconds:.4g} s; the step takes"
+        message += (
+            f" {times.control_s:.4g} s, {times.substeps} steps of the physics: it is {times.substeps} times too large"
+        )
+        evidence = {"element": timed.target, "value": timed.seconds, "expected": times.control_s}
+        yield RuleFinding(RULE, message, evidence, where=timed.where)
+        return
+    yield from _judge_attributes(records)
+
+
 def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
     """Yield what a robot without an engine tells."""
     log: AttributeLog | None = records.facts.get("attributes")

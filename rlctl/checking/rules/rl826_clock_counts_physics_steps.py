@@ -11,6 +11,7 @@ from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.step_times import StepTimes, require_step_times, words_of
+from rlctl.checking.timed_expressions import Use, find_wrong_time
 from rlctl.checking.transitions import find_float_leaves, find_unit_pairs
 from rlctl.checking.worlds import Array
 
@@ -20,10 +21,12 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         A clock that each step advances runs with the time of one step of the physics, or counts the steps of the
-        physics as if each was a whole step: the phase of a gait whose period is declared, a time in seconds, passed or
+        physics as if each was a whole step: a line of the source adds the one time where the other is meant, or it
+        shows in what is observed. It is the phase of a gait whose period is declared, a time in seconds, passed or
         left, a time feature of the observation, or the time limit. All of them are then wrong by the number of physics
         steps in a step. Times are those of the engine; in a robot without an engine they are what it declares, as `dt`
-        and `substeps` or by a loop of its step, and what its positions and velocities confirm.
+        and `substeps` or by a loop of its step, and what its positions and velocities confirm, or those on which most
+        lines that add up times agree.
     """,
     fix="""
         Advance the clock once in each step, by the time between two actions: the physics step times frame_skip, which
@@ -79,7 +82,18 @@ class _Clock:
         return "advances" if self.advance > 0 else "falls"
 
 
-@judges_records(RULE, *RECORDING, "attributes")
+@judges_records(RULE, *RECORDING, "attributes", "expressions")
+def _judge(records: Records) -> Iterator[RuleFinding]:
+    for timed, times in find_wrong_time(records, Use.COUNTED):
+        message = f"{timed.target} advances by {timed.total_s:.4g} s in a step that takes {times.control_s:.4g} s"
+        message += f", with {timed.text}"
+        wrong = _name_wrong(timed.total_s, times)
+        evidence = {"element": timed.target, "value": timed.total_s, "expected": times.control_s}
+        yield RuleFinding(RULE, f"{message}: {wrong}", evidence, where=timed.where)
+        return
+    yield from _find_wrong_clocks(records)
+
+
 def _find_wrong_clocks(records: Records) -> Iterator[RuleFinding]:
     log: AttributeLog = records.require_fact("attributes")
     times = require_step_times(log)

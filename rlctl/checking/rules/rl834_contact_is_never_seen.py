@@ -1,11 +1,16 @@
 """RL834: contact is never seen."""
 
+import ast
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from rlctl.checking.bullet_fields import find_taken_for_force
+from rlctl.checking.compared_ids import find_wrong_ids
 from rlctl.checking.episode import EpisodePlayer
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.feet import BASE, find_feet, list_touched, read_touches
 from rlctl.checking.mujoco_worlds import MujocoStateReader, library
@@ -22,10 +27,11 @@ RULE = Rule(
     "contact is never seen",
     Severity.WARNING,
     meaning="""
-        The robot stands on its feet or wheels, and what says so is 0 in every step: a touch sensor of MuJoCo whose site
-        does not contain the points of contact, which counts only forces inside its site; or numbers of the observation,
-        or a reward term, that are called after the contact of feet. Or such a number is always 1, also while nothing
-        touches. What is rewarded, observed or ended by contacts never changes.
+        The robot stands on its feet or wheels, and what says so is 0 in every step: a touch sensor of MuJoCo whose
+        site does not contain the points of contact, which counts only forces inside its site; or numbers of the
+        observation, or a reward term, that are called after the contact of feet. Or such a number is always 1, also
+        while nothing touches. Or a line compares the geoms of a contact with ids of joints, or its distance with a
+        force. What is rewarded, observed or ended by contacts never changes.
     """,
     fix="""
         Make the site of a touch sensor larger than the geom that touches, and place it around the contact. Compare the
@@ -42,6 +48,22 @@ CONTACT_WORDS = {"contact", "contacts", "grounded", "touch", "touches", "touchin
 FEET = {"feet", "foot", "ground", "wheel", "wheels"}
 MEANT_WORDS = {"on", "in", "flag", "flags", "force", "forces", "sensor", "sensors", "state", "left", "right", "all"}
 """What may stand beside the words above without saying that something else is touched."""
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    found = itertools.chain(find_wrong_ids(RULE, noted.definitions, noted.episodes), _find_distances(noted))
+    yield from itertools.islice(found, 1)
+
+
+def _find_distances(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    """Yield where the distance of a contact point has to be larger than it can be, as a force has to."""
+    for node, least in find_taken_for_force(noted.definitions, noted.functions, noted.reward.numbers):
+        text = " ".join(ast.unparse(node).split())
+        message = f"{text} is never true: field 8 of a contact point is the distance, below 0 where bodies touch, and"
+        message += f" {least:g} m apart there is no contact; the normal force is field 9"
+        place = noted.source.find_place(noted.source.find_statement(node))[0], node.lineno
+        yield RuleFinding(RULE, message, {"element": text, "value": least}, where=place)
 
 
 @judges_trials(RULE, place=31)

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.compared_ids import find_doubled_ids
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.feet import find_feet, read_touches
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -19,9 +21,9 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Two neighbouring elements of the observation say whether feet, fingers or wheels touch something. Both always
-        say the same, and follow one link, while another link touches at other times, and no element follows it. One of
-        the two was looked up by the name or the number of the other. Rewards that use these contacts are wrong for that
-        link as well.
+        say the same, and follow one link, while another link touches at other times, and no element follows it. Or a
+        list of the source looks up one name twice. One of the two was looked up by the name or the number of the
+        other. Rewards that use these contacts are wrong for that link as well.
     """,
     fix="Look each link or geom up by its own name; check that the list of them has no entry twice.",
 )
@@ -32,6 +34,11 @@ UNSEEN = 0.5  # correlation of any element with the contact of the other link
 DIFFERENT = 0.1  # part of the looks in which one link touches and the other does not
 NEAR = 4  # elements, of which one may be that of another foot
 AT_ENDS = 0.2  # part of its range by which a flag with noise is away from its ends
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(find_doubled_ids(RULE, noted.source, noted.of_steps), 1)
 
 
 @judges_worlds(RULE)

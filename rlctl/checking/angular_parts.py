@@ -1,0 +1,58 @@
+"""Where the source reads the angular part of a velocity that has both parts."""
+
+import ast
+from collections.abc import Iterator, Sequence
+
+from rlctl.checking.assignments import read_name
+from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.term_names import split_name
+
+LINEAR, ANGULAR = (
+    {"lin", "linear", "slip", "speed", "linvel"},
+    {"ang", "angular", "omega", "gyro", "rot", "rate", "spin", "turn", "yaw", "w"},
+)
+
+
+def find_angular_parts(notes: NotedEpisodes) -> Iterator[tuple[str, str, tuple[str, int]]]:
+    """Yield where the angular part of a velocity that has both is read as the linear one: what is called so, the
+    expression, and its place."""
+    for one in notes.source.expressions:
+        node = one.node
+        if not isinstance(node, ast.Subscript):
+            continue
+        names = _list_names(notes, one.function, node)
+        words = {word for name in names for word in split_name(name)}
+        if not words & LINEAR or words & ANGULAR:
+            continue
+        is_six = _is_filled(one.function, node.value) or read_name(node.value) == "cvel"
+        if is_six and _is_first_half(node.slice) and any(call.values.get(one.number) for call in notes.steps):
+            yield sorted(words & LINEAR)[0], one.text, one.where
+
+
+def _list_names(
+    notes: NotedEpisodes, function: ast.FunctionDef | ast.AsyncFunctionDef, node: ast.expr
+) -> Sequence[str]:
+    statement = notes.source.find_statement(node)
+    targets = statement.targets if isinstance(statement, ast.Assign) else []
+    names = [read_name(target) for target in targets]
+    return names if names else [function.name]
+
+
+def _is_filled(function: ast.AST, owner: ast.expr) -> bool:
+    """Say whether an array is what MuJoCo writes an object's velocity into: angular first."""
+    for node in ast.walk(function):
+        if isinstance(node, ast.Call) and read_name(node.func) == "mj_objectVelocity":
+            arrays = [*node.args[4:5], *(word.value for word in node.keywords if word.arg == "res")]
+            if any(ast.unparse(one) == ast.unparse(owner) for one in arrays):
+                return True
+    return False
+
+
+def _is_first_half(index: ast.expr) -> bool:
+    last = index.elts[-1] if isinstance(index, ast.Tuple) else index
+    match last:
+        case ast.Slice(lower=None | ast.Constant(value=0 | 1), upper=ast.Constant(value=1 | 2 | 3), step=None):
+            return True
+        case ast.Constant(value=0 | 1 | 2) if isinstance(index, ast.Constant):
+            return True
+    return False

@@ -1,0 +1,176 @@
+"""Commands that a reward compares with a number that is never negative, or with a tolerance that everything meets."""
+
+import ast
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from rlctl.checking.assignments import CONVERSIONS, Assignment, read_name
+from rlctl.checking.definitions import ReadExpression
+from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.expressions import NotedCall
+from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, PART, ErrorReader, Numbers, has_both_signs
+from rlctl.checking.products import list_product
+from rlctl.checking.summands import Summand
+from rlctl.checking.term_names import split_name
+
+SIZES = {"norm", "hypot", "abs", "absolute", "fabs", "square", "sqrt"}
+SAME_SIGN = CONVERSIONS | {"sum", "mean", "max", "min", "clip", "round"}
+BEGINNINGS = {"zeros", "zeros_like"}
+MOST_SEEN = 100  # names that are followed
+MET = 0.98  # of the largest value of a kernel: what a tolerance pays that everything meets
+CLEARLY, MOST_CHANGES = 0.25, 0.1  # parts: of the largest difference, of the steps
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class OneSided:
+    """A difference of a command, which has both signs, and a number that is never negative."""
+
+    summand: Summand
+    place: ReadExpression  # of the difference
+    size: ast.expr  # what is never negative
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AlwaysMet:
+    """A part of the reward that is nearly its maximum in each step, whatever the command is."""
+
+    summand: Summand
+    place: ReadExpression
+    difference: ast.expr
+    least: float
+
+
+class SizeReader:
+    """Finds them."""
+
+    def __init__(self, notes: NotedEpisodes) -> None:
+        self.notes, self.reward = notes, notes.reward
+        self.errors, self.definitions = ErrorReader(notes), notes.reward.definitions
+        self._lengths: list[ast.expr] = []
+
+    def find_one_sided(self) -> Iterator[OneSided]:
+        """Yield differences that cannot be 0 for half of the commands."""
+        for summand in self.reward.summands:
+            for place, wanted, other in self._list_differences(summand.place):
+                commands, values = (self.reward.numbers.list_values(side.node) for side in (wanted, other))
+                if not has_both_signs(commands, PART) or values.size < FEWEST or values.min() < 0:
+                    continue
+                self._lengths = []
+                if self._is_never_negative(other, set()) and self._lengths:
+                    yield OneSided(summand, place, self._lengths[0])
+
+    def _list_differences(
+        self, place: ReadExpression
+    ) -> Iterator[tuple[ReadExpression, ReadExpression, ReadExpression]]:
+        """Yield the differences of a command, or a goal, and something else."""
+        for one in self.definitions.walk(place):
+            match one.node:
+                case ast.BinOp(left=left, op=ast.Sub(), right=right):
+                    sides = [one.at(left), one.at(right)]
+                    wanted = [self.errors.is_wanted(side) for side in sides]
+                    words = {word for part in ast.walk(one.node) for word in split_name(read_name(part))}  # type: ignore[arg-type]
+                    if sum(wanted) == 1 and not words & EARLIER_WORDS:
+                        yield one, sides[wanted.index(True)], sides[wanted.index(False)]
+
+    def _is_never_negative(self, place: ReadExpression, seen: set[tuple[object, str]]) -> bool:
+        """Say whether the source lets a number be at least 0 only. One that is replaced by a mean of itself and others
+        is so if these are."""
+        node, key = place.node, (place.function, ast.unparse(place.node))
+        if key in seen or len(seen) > MOST_SEEN:
+            return key in seen
+        constant = self.reward.numbers.read_constant(node)
+        if constant is not None and not isinstance(node, ast.Attribute | ast.Subscript):
+            return constant >= 0
+        match node:
+            case ast.Call(func=function) if read_name(function) in SIZES:
+                self._lengths.append(node)
+                return True
+            case ast.Call(func=function) if read_name(function) in BEGINNINGS:
+                return True
+            case ast.Call(func=function, args=[first, *_]) if read_name(function) in SAME_SIGN:
+                owner = function.value if isinstance(function, ast.Attribute) else None
+                is_method = owner is not None and ast.unparse(owner) not in ("np", "numpy", "math", "torch")
+                return self._is_never_negative(place.at(owner if is_method and owner is not None else first), seen)
+            case ast.Call(func=ast.Attribute(value=owner, attr=name), args=[]) if name in SAME_SIGN:
+                return self._is_never_negative(place.at(owner), seen)
+            case ast.BinOp(op=ast.Pow(), right=ast.Constant(value=int(power))) if power % 2 == 0:
+                self._lengths.append(node)
+                return True
+            case ast.BinOp(left=left, op=ast.Add() | ast.Mult() | ast.Div(), right=right):
+                return all(
+                    self._is_never_negative(place.at(side), seen) or self._is_share(side) for side in (left, right)
+                )
+            case ast.Name() | ast.Attribute() | ast.Subscript() | ast.Call():
+                return self._is_defined_so(place, seen | {key})
+        return False
+
+    def _is_share(self, node: ast.expr) -> bool:
+        """Say whether it is a constant, or what a share leaves of 1."""
+        values = self.reward.numbers.list_values(node)
+        return bool(values.size and (values == values[0]).all() and values[0] >= 0)
+
+    def _is_defined_so(self, place: ReadExpression, seen: set[tuple[object, str]]) -> bool:
+        text = ast.unparse(place.node)
+        if isinstance(place.node, ast.Call):
+            found = self.definitions.list_returned(place)
+            return bool(found) and all(self._is_never_negative(one, seen) for one in found)
+        if isinstance(place.node, ast.Name) and not self.definitions.list_assigned(place.function).get(text):
+            given = place.arguments.get(text)
+            return given is not None and self._is_never_negative(given, seen)
+        inside = [place.function] if isinstance(place.node, ast.Name) else self.definitions.called
+        assigned = [one for function in inside for one in self.definitions.list_assigned(function).get(text, ())]
+        seen = seen | {(one.function, text) for one in assigned}
+        return bool(assigned) and all(self._is_assigned_so(one, place, text, seen) for one in assigned)
+
+    def _is_assigned_so(self, one: Assignment, place: ReadExpression, text: str, seen: set[tuple[object, str]]) -> bool:
+        if not one.is_known:
+            return False
+        arguments = place.arguments if one.function is place.function else {}
+        for value, sign in one.parts:
+            here = ReadExpression(value, one.function, arguments, place.depth + 1)
+            parts = [self._read_filtered(here, text)] if one.added else self.definitions.select(here, one.element)
+            if sign < 0 or not parts or not all(self._is_never_negative(part, seen) for part in parts):
+                return False
+        return True
+
+    def _read_filtered(self, place: ReadExpression, text: str) -> ReadExpression:
+        """Return x of `y += share * (x - y)`; the value itself where it is not of this form."""
+        for factor in list_product(place.node):
+            match factor:
+                case ast.BinOp(left=left, op=ast.Sub(), right=right) if ast.unparse(right) == text:
+                    return place.at(left)
+        return place
+
+    def find_always_met(self) -> Iterator[AlwaysMet]:
+        """Yield kernels of a difference to a command whose tolerance is far above all differences."""
+        for summand in self.reward.summands:
+            for factor in list_product(summand.place.node):
+                place = summand.place.at(factor)
+                values = self.reward.numbers.list_values(factor)
+                if values.size < FEWEST or values.min() < MET or values.max() > 1 + 1e-9 or not np.ptp(values) > 0:
+                    continue
+                for one, wanted, _ in self._list_differences(place):
+                    if self._is_drawn(one, wanted):
+                        yield AlwaysMet(summand, place, one.node, float(values.min()))
+
+    def _is_drawn(self, difference: ReadExpression, wanted: ReadExpression) -> bool:
+        """Say whether a command differs between episodes as much as the difference to it, and is kept in them."""
+        differences, commands = (self.reward.numbers.list_values(one.node) for one in (difference, wanted))
+        noted = self.notes.source.find(wanted.node)
+        if noted is None or differences.size < FEWEST:
+            return False
+        changes = [
+            not np.array_equal(before, after)
+            for episode in self.notes.episodes
+            for before, after in itertools.pairwise(_list_last(episode[1:], noted.number))
+        ]
+        is_kept = bool(changes) and np.mean(changes) <= MOST_CHANGES
+        return bool(is_kept and np.ptp(commands) > CLEARLY * float(np.abs(differences).max()))
+
+
+def _list_last(calls: Sequence[NotedCall], number: int) -> list[Numbers]:
+    values = [call.values[number][-1] if call.values.get(number) else None for call in calls]
+    return [np.asarray(value, np.float64) for value in values if value is not None]

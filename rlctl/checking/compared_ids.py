@@ -1,0 +1,146 @@
+"""Where the source compares the ids of contacts with ids of another kind, or looks one part up twice."""
+
+import ast
+import collections
+from collections.abc import Collection, Iterator, Sequence
+
+from rlctl.checking.assignments import CONVERSIONS
+from rlctl.checking.definitions import Definitions
+from rlctl.checking.expressions import NotedCall, SourceCode
+from rlctl.checking.rule import Rule, RuleFinding
+from rlctl.checking.term_names import split_name
+
+KINDS = {"geom": "geom", "body": "body", "joint": "joint", "jnt": "joint", "site": "site", "actuator": "actuator"}
+LOADERS = {"loadURDF", "createMultiBody", "loadMJCF", "loadSDF"}
+BODY, LINK, DISTANCE = (1, 2), (3, 4), 8  # fields of a contact point of PyBullet
+LOOKUPS = {"id", "name2id", "index", "find", "link", "joint", "geom", "body", "site", "sensor", "actuator"}
+FEWEST = 10
+DEEPEST = 6  # assignments that are followed
+
+
+class Ids:
+    """Of which kind the ids are that expressions hold: those of geoms, bodies, joints, sites, actuators, or links."""
+
+    def __init__(self, definitions: Definitions) -> None:
+        self._definitions = definitions
+
+    def find(self, node: ast.expr, depth: int = 0) -> set[str]:
+        """Return the kinds of an expression, or of what it holds; empty for what is not known."""
+        if depth > DEEPEST:
+            return set()
+        match node:
+            case ast.Attribute(attr="geom1" | "geom2"):
+                return {"geom"}
+            case ast.Subscript(value=ast.Attribute(attr="geom", value=ast.expr() as owner)) if self.is_contact(owner):
+                return {"geom"}
+            case ast.Subscript(value=owner, slice=ast.Constant(value=int(field))) if self.is_point(owner):
+                return {"body"} if field in BODY else {"link"} if field in LINK else set()
+            case ast.Subscript(value=ast.Attribute(attr=name)) if name in ("geom_bodyid", "body_rootid", "site_bodyid"):
+                return {"body"}
+            case ast.Attribute(attr="id", value=ast.Call(func=ast.Attribute(attr=name))) if name in KINDS:
+                return {KINDS[name]}
+            case ast.Call(func=ast.Attribute(attr="mj_name2id"), args=[_, kind, *_]):
+                words = ast.unparse(kind).rsplit("mjOBJ_", 1)
+                return {KINDS[words[-1].lower()]} if words[-1].lower() in KINDS else set()
+            case ast.Call(func=ast.Attribute(attr=name)) if name in LOADERS:
+                return {"body"}
+            case ast.List(elts=parts) | ast.Tuple(elts=parts) | ast.Set(elts=parts):
+                return {kind for part in parts for kind in self.find(part, depth + 1)}
+            case ast.ListComp(elt=part) | ast.SetComp(elt=part) | ast.GeneratorExp(elt=part):
+                return self.find(part, depth + 1)
+            case ast.Call(func=function, args=[part, *_]) if ast.unparse(function).rsplit(".", 1)[-1] in (
+                *("set", "list", "tuple", "sorted", "frozenset", "int", *CONVERSIONS),
+            ):
+                return self.find(part, depth + 1)
+            case ast.Name() | ast.Attribute():
+                return self._unite(self._definitions.read(node), depth)
+            case ast.Call():
+                return self._unite(self._definitions.read_returned(node), depth)
+        return set()
+
+    def _unite(self, values: Sequence[ast.expr], depth: int) -> set[str]:
+        found = [self.find(value, depth + 1) for value in values]
+        return set[str]().union(*found) if found and all(found) else set()
+
+    def is_point(self, node: ast.expr) -> bool:
+        """Say whether a name goes through the contact points of PyBullet."""
+        values = self._definitions.read(node) if isinstance(node, ast.Name) else ()
+        return bool(values) and all(self._lists_points(value) for value in values)
+
+    def _lists_points(self, node: ast.expr, depth: int = 0) -> bool:
+        match node:
+            case ast.Call(func=ast.Attribute(attr="getContactPoints")):
+                return True
+            case ast.BoolOp(values=[first, *_]):
+                return self._lists_points(first, depth)
+            case ast.Name() | ast.Attribute() if depth < DEEPEST:
+                values = self._definitions.read(node)
+                return bool(values) and all(self._lists_points(value, depth + 1) for value in values)
+        return False
+
+    def is_contact(self, node: ast.expr) -> bool:
+        """Say whether an expression is called a contact, or several."""
+        return bool({"contact", "contacts", "con", "c"} & set(split_name(ast.unparse(node).rsplit(".", 1)[-1])))
+
+
+def find_wrong_ids(
+    rule: Rule, definitions: Definitions, episodes: Sequence[Sequence[NotedCall]]
+) -> Iterator[RuleFinding]:
+    """Yield comparisons of the ids of contacts with those of another kind, and of a distance that is never so large."""
+    ids = Ids(definitions)
+    for one in definitions.source.expressions:
+        if not isinstance(one.node, ast.Compare):
+            continue
+        left, right = one.node.left, one.node.comparators[0]
+        values = [value for episode in episodes for call in episode for value in call.values.get(one.number, ())]
+        if isinstance(one.node.ops[0], ast.Eq | ast.NotEq | ast.In | ast.NotIn):
+            for contact, others in ((left, right), (right, left)):
+                theirs = ids.find(contact)
+                for other in _open_literal(others) if theirs in ({"geom"}, {"link"}) and len(values) >= FEWEST else ():
+                    wrong = sorted(ids.find(other) - theirs)
+                    if not wrong or ids.find(other) & theirs:
+                        continue
+                    message = (
+                        f"{one.text} compares the id of a contact's {min(theirs)} with {ast.unparse(other)}, which is"
+                    )
+                    message += f" that of a {wrong[0]}: ids of different kinds have nothing to do with each other"
+                    yield RuleFinding(rule, message, {"element": one.text, "value": wrong}, where=one.where)
+        match left, one.node.ops[0]:
+            case ast.Subscript(value=owner, slice=ast.Constant(value=8)), ast.Gt() | ast.GtE() if ids.is_point(owner):
+                if len(values) >= FEWEST and not any(values):
+                    message = f"{one.text} was false for all {len(values)} contact points: field {DISTANCE} of a"
+                    message += (
+                        " contact point is the distance, and below 0 where bodies touch; the normal force is field 9"
+                    )
+                    yield RuleFinding(rule, message, {"element": one.text, "value": len(values)}, where=one.where)
+
+
+def _open_literal(node: ast.expr) -> list[ast.expr]:
+    return node.elts if isinstance(node, ast.Set | ast.Tuple | ast.List) else [node]
+
+
+def find_doubled_ids(rule: Rule, source: SourceCode, evaluated: Collection[ast.AST]) -> Iterator[RuleFinding]:
+    """Yield lists in which one part is looked up twice by its name, in classes whose functions were evaluated."""
+    for file, tree in source.trees.items():
+        classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+        own = [one for one in classes if one.name in source.classes or any(node in evaluated for node in one.body)]
+        for node in (node for one in own for node in ast.walk(one)):
+            if not isinstance(node, ast.List | ast.Tuple) or len(node.elts) < 2:
+                continue
+            texts = [ast.unparse(part) for part in node.elts if _is_lookup(part)]
+            doubled = [text for text, count in collections.Counter(texts).items() if count > 1]
+            if doubled and len(texts) == len(node.elts):
+                message = f"{ast.unparse(node)} looks up {doubled[0]} twice: another part of the list is left out"
+                yield RuleFinding(rule, message, {"element": doubled[0]}, where=(file, node.lineno))
+
+
+def _is_lookup(node: ast.expr) -> bool:
+    """Say whether an expression is an id that is looked up by a name, with nothing else that tells them apart."""
+    calls = [one for one in ast.walk(node) if isinstance(one, ast.Call)]
+    for call in calls:
+        name = call.func.attr if isinstance(call.func, ast.Attribute) else ast.unparse(call.func)
+        is_named = any(isinstance(one, ast.Constant) and isinstance(one.value, str) for one in call.args)
+        is_id = (isinstance(node, ast.Attribute) and node.attr == "id") or "id" in name or "index" in name
+        if is_named and is_id and set(split_name(name.replace("2", "_"))) & LOOKUPS:
+            return True
+    return False

@@ -1,0 +1,143 @@
+"""The experiment `expressions`: plays short episodes and notes what the expressions of the source are worth, for rules
+that look at how numbers are computed."""
+
+import ast
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+from rlctl.checking.definitions import Definitions
+from rlctl.checking.episode import EpisodePlayer, Moment
+from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
+from rlctl.checking.expressions import ExpressionRecorder, Function, NotedCall, SourceCode, record_expressions
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance
+from rlctl.checking.progress import read_clock
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
+from rlctl.checking.rule import NotApplicable, RuleFinding
+from rlctl.checking.summands import RewardReader
+from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
+from rlctl.checking.vector_series import VectorSeries
+from rlctl.checking.wrong_turns import TurnedVectors
+
+EPISODES = ("random", "zero", "extreme", "random", "rare")
+"""How the actions of each episode are chosen."""
+STEPS = 80  # of an episode
+LONGEST_S = 10.0  # for episodes that are played again [s]
+MOST_NOTED = 300_000  # values; no episode begins after so many
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class NotedEpisodes:
+    """The expressions of a source, and what was noted of them, by episodes and their calls: the reset, and steps."""
+
+    source: SourceCode
+    episodes: Sequence[Sequence[NotedCall]]
+    instance: Instance
+    recorder: ExpressionRecorder
+    _times: list[float] = dataclasses.field(default_factory=list)  # of what was played again [s]
+
+    def play(self, number: int, steps: int, forced: Mapping[int, Mapping[int, Any]]) -> list[tuple[NotedCall, Moment]]:
+        """Play an episode again for some steps, in which expressions are worth what is given, by steps and by their
+        numbers. It ends where the environment raises an exception: what is forced may lead anywhere. Nothing is played
+        where it took too long already."""
+        kind = EPISODES[number]
+        began = read_clock()
+        if sum(self._times) > LONGEST_S:
+            return []
+        player = EpisodePlayer(self.instance, FIRST_SEED + number, kind, number=number, max_steps=steps)
+        played: list[tuple[NotedCall, Moment]] = []
+        try:
+            while not player.ended or not played:
+                self.recorder.forced = dict(forced.get(len(played), {}))
+                with self.recorder.call(len(played)) as noted:
+                    moment = player.step() if played else player.reset()
+                played.append((noted, moment))
+        except EnvironmentRaised:
+            pass
+        finally:
+            self.recorder.forced = {}
+            self._times.append(read_clock() - began)
+        return played
+
+    @functools.cached_property
+    def definitions(self) -> Definitions:
+        """What defines the expressions."""
+        return Definitions(self.source, self.episodes)
+
+    @functools.cached_property
+    def of_steps(self) -> Collection[ast.AST]:
+        """The functions that steps run."""
+        return {self.source.expressions[number].function for call in self.steps for number in call.values}
+
+    @functools.cached_property
+    def functions(self) -> list[Function]:
+        """All functions of the source that were run."""
+        calls = [call for episode in self.episodes for call in episode]
+        run = dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)
+        return list(run)
+
+    @property
+    def steps(self) -> list[NotedCall]:
+        """The steps of all episodes."""
+        return [call for episode in self.episodes for call in episode[1:]]
+
+    @functools.cached_property
+    def turned(self) -> TurnedVectors:
+        """The vectors that the source turns."""
+        return TurnedVectors(VectorSeries(self.source, self.episodes))
+
+    @functools.cached_property
+    def reward(self) -> RewardReader:
+        """What is added up to the reward."""
+        author = self.source.author
+        weights = {} if hasattr(author, "step") else getattr(author, "reward_weights", {})  # of a task
+        return RewardReader(self.definitions, self.steps, weights)
+
+
+BY_EXPRESSIONS = "findings by expressions"
+"""The fact with findings that count where a rule has found nothing else: they may show the same mistake."""
+judges_expressions = JudgeHook[NotedEpisodes]()
+"""Shows the noted episodes of an instance."""
+
+
+@contextlib.contextmanager
+def noted_episodes(context: Context) -> Iterator[NotedEpisodes]:
+    """Play short episodes with functions that note their expressions, as long as this lasts. The instance is a new one:
+    what is forced may lead anywhere.
+
+    Raises `NotApplicable` where there is no source.
+    """
+    with context.fresh() as instance:
+        source = SourceCode(instance.env)
+        if not source.expressions:
+            raise NotApplicable("its source is that of a library, or cannot be read")
+        with record_expressions(source) as recorder:
+            yield NotedEpisodes(source, _play_all(instance, recorder), instance, recorder)
+
+
+def _play_all(instance: Instance, recorder: ExpressionRecorder) -> list[list[NotedCall]]:
+    episodes: list[list[NotedCall]] = []
+    for number, kind in enumerate(EPISODES):
+        player = EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS)
+        with recorder.call(0) as noted:
+            player.reset()
+        episodes.append([noted])
+        while not player.ended:
+            with recorder.call(player.steps + 1) as noted:
+                player.step()
+            episodes[-1].append(noted)
+        if recorder.total > MOST_NOTED or instance.context.budget.is_over():
+            break
+    return episodes
+
+
+@experiment("expressions", INSTANCES, 35, share=3.0, hooks=(judges_expressions,))
+def note_expressions(context: Context) -> Iterator[ChildMessage]:
+    """Show what was noted to all judges."""
+    with noted_episodes(context) as noted:
+        yield Fact(TIMED, find_timed_expressions(noted.source, noted.episodes))
+        shown = list(judges_expressions.judge(noted))
+    yield Fact(BY_EXPRESSIONS, [message for message in shown if isinstance(message, RuleFinding)])
+    yield from (message for message in shown if not isinstance(message, RuleFinding))

@@ -1,0 +1,334 @@
+"""The expressions of an environment's own source, and what they were worth in each call of `reset` and `step`.
+
+The code of its functions is replaced by copies that note each expression; nothing is imported or built again.
+"""
+
+import ast
+import builtins
+import collections
+import contextlib
+import copy
+import dataclasses
+import functools
+import inspect
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.values import MOST_NUMBERS, NUMBERS, find_author, list_own_classes
+from rlctl.environments.places import is_own_file
+
+NOTE = "__rlctl_note__"  # the name of the function that is called with each value
+MOST_MODULES, MOST_EVENTS = 20, 1_500_000
+Number = float | NDArray[np.float64]
+Value = Number | None  # None for what is no number and no small array of numbers
+Function = ast.FunctionDef
+_WITH_CONTEXT = ast.Name | ast.Attribute | ast.Subscript | ast.List | ast.Tuple
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Expression:
+    """An expression of the source that is noted."""
+
+    number: int  # its place among all
+    node: ast.expr
+    file: str
+    function: Function  # in which it stands
+
+    @functools.cached_property
+    def text(self) -> str:
+        """The expression as it is written, in one line."""
+        return " ".join(ast.unparse(self.node).split())
+
+    @property
+    def where(self) -> tuple[str, int]:
+        """File and line."""
+        return self.file, self.node.lineno
+
+
+class SourceCode:
+    """The modules of an environment's author: those of its classes, and of the same folder what they have imported."""
+
+    def __init__(self, env: Any) -> None:
+        self.author = find_author(env)
+        self.modules = _list_modules(env)
+        self.classes = [cls.__name__ for cls in list_own_classes(find_author(env))]
+        """The author's classes of the environment, the most derived first."""
+        self.trees: dict[str, ast.Module] = {}
+        for module in self.modules:
+            with contextlib.suppress(OSError, SyntaxError, ValueError):
+                self.trees[str(module.__file__)] = ast.parse(Path(str(module.__file__)).read_bytes())
+        self.expressions: list[Expression] = []
+        self.parents: dict[ast.AST, ast.AST] = {}
+        for file, tree in self.trees.items():
+            self.parents |= {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
+            for function in ast.walk(tree):
+                if isinstance(function, Function):
+                    self._number(file, function)
+        self._numbers = {one.node: one.number for one in self.expressions}
+
+    def _number(self, file: str, function: Function) -> None:
+        for node in walk_own(function):
+            if isinstance(node, ast.expr) and _is_noted(node):
+                node.noted = len(self.expressions)  # type: ignore[attr-defined]  # copies of the node keep it
+                self.expressions.append(Expression(len(self.expressions), node, file, function))
+
+    def find(self, node: ast.AST) -> Expression | None:
+        """Return the noted expression of a node; None for one that is not noted, such as a constant."""
+        number = self._numbers.get(node)  # type: ignore[call-overload]
+        return None if number is None else self.expressions[number]
+
+    @functools.cached_property
+    def functions(self) -> Mapping[str, Sequence[Function]]:
+        """All functions and methods by name."""
+        found = collections.defaultdict[str, list[Function]](list)
+        for tree in self.trees.values():
+            for node in ast.walk(tree):
+                if isinstance(node, Function):
+                    found[node.name].append(node)
+        return found
+
+    def find_statement(self, node: ast.AST) -> ast.stmt:
+        """Return the innermost statement that has a node."""
+        while not isinstance(node, ast.stmt):
+            node = self.parents[node]
+        return node
+
+    def find_place(self, node: ast.stmt) -> tuple[str, int]:
+        """Return file and line of a statement."""
+        top: ast.AST = node
+        while top in self.parents:
+            top = self.parents[top]
+        return next(file for file, tree in self.trees.items() if tree is top), node.lineno
+
+    def find_function(self, node: ast.AST) -> Function:
+        """Return the innermost function around a node."""
+        while not isinstance(node, Function):
+            node = self.parents[node]
+        return node
+
+
+@dataclasses.dataclass(eq=False)
+class NotedCall:
+    """What was noted in one call of `reset` or `step`."""
+
+    step: int  # 0 is the reset
+    events: list[tuple[int, Value]]  # the number of an expression, and its value, in the order of their evaluation
+
+    @functools.cached_property
+    def values(self) -> Mapping[int, list[Value]]:
+        """The values of each expression, by its number."""
+        found = collections.defaultdict[int, list[Value]](list)
+        for number, value in self.events:
+            found[number].append(value)
+        return found
+
+    def pair(self, whole: int, parts: Sequence[int]) -> Iterator[tuple[Value, list[Value]]]:
+        """Yield each value of an expression with those that its parts had before it; None for one that was not
+        evaluated."""
+        latest: dict[int, Value] = {}
+        for number, value in self.events:
+            if number == whole:
+                yield value, [latest.pop(part, None) for part in parts]
+            elif number in parts:
+                latest[number] = value
+
+
+class ExpressionRecorder:
+    """Notes values into the call that is going on."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[int, Value]] | None = None  # None between calls
+        self.total = 0
+        self.forced: dict[int, Any] = {}
+        """What expressions are to be worth, by their numbers, whatever they are."""
+
+    def note(self, number: int, value: Any) -> Any:
+        """Note a value, and return it."""
+        if number in self.forced:
+            value = self.forced[number]
+        if self.events is not None and self.total < MOST_EVENTS:
+            self.events.append((number, _freeze(value)))
+            self.total += 1
+        return value
+
+    @contextlib.contextmanager
+    def call(self, step: int) -> Iterator[NotedCall]:
+        """Note what is evaluated inside."""
+        noted = NotedCall(step, [])
+        self.events = noted.events
+        try:
+            yield noted
+        finally:
+            self.events = None
+
+
+@contextlib.contextmanager
+def record_expressions(source: SourceCode) -> Iterator[ExpressionRecorder]:
+    """Replace the code of the author's functions by copies that note their expressions, as long as this lasts."""
+    recorder = ExpressionRecorder()
+    codes: dict[tuple[str, str, int], CodeType] = {}
+    for file, tree in source.trees.items():
+        noting = ast.fix_missing_locations(_Noting().visit(copy.deepcopy(tree)))
+        codes |= {
+            (file, code.co_name, code.co_firstlineno): code for code in _list_codes(compile(noting, file, "exec"))
+        }
+    replaced: list[tuple[FunctionType, CodeType]] = []
+    setattr(builtins, NOTE, recorder.note)
+    try:
+        for module in source.modules:
+            for function in _list_functions(module):
+                old = function.__code__
+                new = codes.get((str(module.__file__), old.co_name, old.co_firstlineno))
+                if new is not None and new.co_freevars == old.co_freevars:
+                    replaced.append((function, old))
+                    function.__code__ = new
+        yield recorder
+    finally:
+        for function, old in replaced:
+            function.__code__ = old
+        delattr(builtins, NOTE)
+
+
+def _list_modules(env: Any) -> list[ModuleType]:
+    own = [sys.modules.get(cls.__module__) for cls in list_own_classes(find_author(env))]
+    modules = {id(module): module for module in own if module is not None and getattr(module, "__file__", None)}
+    folders = {Path(str(module.__file__)).parent for module in modules.values()}
+    for module in list(sys.modules.values()):
+        file = getattr(module, "__file__", None)
+        if isinstance(file, str) and Path(file).parent in folders and is_own_file(file):
+            modules.setdefault(id(module), module)
+    return list(modules.values())[:MOST_MODULES]
+
+
+def _list_functions(module: ModuleType) -> Iterator[FunctionType]:
+    """Yield the functions of a module and of its classes."""
+    for member in list(vars(module).values()):
+        if isinstance(member, type) and member.__module__ == module.__name__:
+            for one in list(vars(member).values()):
+                yield from _unwrap(one)
+        else:
+            yield from _unwrap(member)
+
+
+def _unwrap(member: Any) -> Iterator[FunctionType]:
+    parts = [member]
+    if isinstance(member, staticmethod | classmethod):
+        parts = [member.__func__]
+    elif isinstance(member, property):
+        parts = [member.fget, member.fset]
+    elif isinstance(member, functools.cached_property):
+        parts = [member.func]
+    for part in parts:
+        with contextlib.suppress(ValueError):  # of a function that wraps itself
+            inner = inspect.unwrap(part) if isinstance(part, FunctionType) else part
+            if isinstance(inner, FunctionType):
+                yield inner
+
+
+def _list_codes(code: CodeType) -> Iterator[CodeType]:
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield constant
+            yield from _list_codes(constant)
+
+
+def walk_own(function: Function) -> Iterator[ast.AST]:
+    """Yield the nodes of a function's statements, without those of functions and classes in it."""
+    waiting: list[ast.AST] = [*reversed(function.body)]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        if not isinstance(node, Function | ast.AsyncFunctionDef | ast.ClassDef):
+            waiting += reversed(list(ast.iter_child_nodes(node)))
+
+
+def _is_noted(node: ast.expr) -> bool:
+    if isinstance(node, _WITH_CONTEXT):
+        return isinstance(node.ctx, ast.Load)
+    return isinstance(node, ast.BinOp | ast.UnaryOp | ast.BoolOp | ast.Compare | ast.Call | ast.IfExp)
+
+
+class _Noting(ast.NodeTransformer):
+    """Puts a call around each expression that is noted, in the bodies of functions."""
+
+    def __init__(self) -> None:
+        self._is_inside = False
+
+    def visit_FunctionDef(self, node: Any) -> Any:
+        """Change the statements, and neither defaults nor decorators."""
+        was_inside, self._is_inside = self._is_inside, True
+        node.body = [self.visit(one) for one in node.body]
+        self._is_inside = was_inside
+        return node
+
+    def visit_AsyncFunctionDef(self, node: Any) -> Any:
+        """Leave it as it is: no environment is called so."""
+        return node
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> Any:
+        """Change only the methods: a class may be made in a function."""
+        was_inside, self._is_inside = self._is_inside, False
+        node.body = [self.visit(one) for one in node.body]
+        self._is_inside = was_inside
+        return node
+
+    def visit(self, node: Any) -> Any:
+        """Change what is inside first."""
+        if isinstance(node, ast.JoinedStr | ast.match_case | ast.Lambda):
+            return node
+        if isinstance(node, ast.AnnAssign):
+            node.value = self.visit(node.value) if node.value else None
+            return node
+        number = getattr(node, "noted", None)
+        self._visit_parts(node)
+        if number is None or not self._is_inside:
+            return node
+        call = ast.Call(ast.Name(NOTE, ast.Load()), [ast.Constant(number), node], [])
+        return ast.copy_location(call, node)
+
+    def _visit_parts(self, node: Any) -> None:
+        """Change the parts of a node; the owner of an attribute, and what is called, are no values of their own."""
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                super().visit(node)
+            case ast.Attribute(value=owner):
+                node.value = self._visit_owner(owner)
+            case ast.Subscript(value=owner, slice=index):
+                node.value, node.slice = self._visit_owner(owner), self.visit(index)
+            case ast.Call(func=function):
+                node.func = self._visit_owner(function)
+                node.args = [self.visit(one) for one in node.args]
+                node.keywords = [self.visit(one) for one in node.keywords]
+            case _:
+                self.generic_visit(node)
+
+    def _visit_owner(self, owner: ast.expr) -> Any:
+        if isinstance(owner, ast.Name):
+            return owner
+        if isinstance(owner, ast.Attribute | ast.Subscript):
+            self._visit_parts(owner)
+            return owner
+        return self.visit(owner)
+
+
+def _freeze(value: Any) -> Value:
+    kind = type(value)
+    if kind is float or kind is bool or kind is int:
+        return float(value) if abs(value) < 1e300 else None
+    if kind is np.ndarray:
+        return np.array(value, np.float64) if value.size <= MOST_NUMBERS and value.dtype.kind in "biuf" else None
+    if isinstance(value, NUMBERS):
+        return float(value)
+    if (
+        isinstance(value, list | tuple)
+        and len(value) <= MOST_NUMBERS
+        and all(isinstance(one, NUMBERS) for one in value)
+    ):
+        return np.array(value, np.float64)
+    return None

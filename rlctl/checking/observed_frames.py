@@ -1,0 +1,215 @@
+"""Vectors in the axes of the world that the source puts into an observation next to vectors in the frame of the
+robot."""
+
+import ast
+import functools
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.assignments import CONVERSIONS
+from rlctl.checking.definitions import Definitions
+from rlctl.checking.expressions import Function
+from rlctl.checking.rule import Rule, RuleFinding
+from rlctl.checking.turned_expressions import VectorTurn
+from rlctl.checking.vector_series import VectorSeries, list_words
+from rlctl.checking.world_vectors import WorldVectors
+from rlctl.checking.wrong_turns import FRAME_RULES, TurnedVectors
+
+Array = NDArray[np.float64]
+
+OBSERVERS = {"observe", "_observe"}  # of tasks, which have no step of their own
+PASSED_ON = {
+    "append", "clip", "column_stack", "concatenate", "dict", "hstack", "items", "list", "reshape", "stack", "tuple",
+    "values", "vstack", "zip", "enumerate", *CONVERSIONS,
+}  # fmt: skip
+SEEN_WORDS = {"ray", "rays", "scan", "scans", "lidar", "camera", "image", "pixels", "ranges", "sonar"}
+DEEPEST = 14
+SAME, MOSTLY = 1e-6, 0.9
+WIDE = 2.0  # range of the headings in which episodes begin [rad]
+
+
+class ObservedCode:
+    """The pieces of code of which an observation is made."""
+
+    def __init__(self, series: VectorSeries, definitions: Definitions, turns: list[VectorTurn]) -> None:
+        self._series, self._definitions = series, definitions
+        self._turned = {turn.whole.node for turn in turns}
+
+    @functools.cached_property
+    def nodes(self) -> list[ast.expr]:
+        """All of them, as far as elements of the observation are their elements."""
+        found: dict[ast.expr, None] = {}
+        source = self._series.source
+        classes = [node for tree in source.trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+        own = sorted((one for one in classes if one.name in source.classes), key=lambda o: source.classes.index(o.name))
+        methods = [one for owner in reversed(own) for one in owner.body if isinstance(one, Function)]
+        for function in {one.name: one for one in methods}.values():
+            for root in self._list_roots(function):
+                self._visit(root, found, 0)
+        return list(found)
+
+    def _list_roots(self, function: Function) -> Iterator[ast.expr]:
+        for node in ast.walk(function):
+            match node:
+                case ast.Return(value=ast.Tuple(elts=[first, *_])) if function.name == "step":
+                    yield first
+                case ast.Return(value=ast.expr() as value) if function.name in OBSERVERS:
+                    yield value
+
+    def is_base_velocity(self, node: ast.expr | None) -> bool:
+        """Say whether a name has what PyBullet returns as a velocity of a base, in the world's frame."""
+        while isinstance(node, ast.Call) and ast.unparse(node.func).rsplit(".", 1)[-1] in PASSED_ON and node.args:
+            node = node.args[0]
+        values = self._definitions.read_parts(node) if isinstance(node, ast.Name) else ()
+        return any("getBaseVelocity(" in ast.unparse(value) for value in values)
+
+    def _visit(self, node: ast.expr, found: dict[ast.expr, None], depth: int) -> None:
+        if node in found or depth > DEEPEST:
+            return
+        found[node] = None
+        is_difference = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
+        if node in self._turned or (is_difference and self._is_vector(node)):
+            return
+        for part in self._list_parts(node):
+            self._visit(part, found, depth + 1)
+
+    def _is_vector(self, node: ast.expr) -> bool:
+        return any(self._series.read(node, size=size) is not None for size in (2, 3))
+
+    def _list_parts(self, node: ast.expr) -> list[ast.expr]:
+        match node:
+            case ast.Dict(values=values):
+                return values
+            case ast.List(elts=parts) | ast.Tuple(elts=parts):
+                return parts
+            case ast.Starred(value=value) | ast.UnaryOp(operand=value) | ast.Subscript(value=value):
+                return [value]
+            case ast.ListComp(elt=value) | ast.GeneratorExp(elt=value) | ast.DictComp(value=value):
+                return [value]
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult() | ast.Div(), right=right):
+                return [left, right]
+            case ast.IfExp(body=body, orelse=other):
+                return [body, other]
+            case ast.Name():
+                return [*self._definitions.read(node), *self._definitions.read_parts(node), *self._list_appended(node)]
+            case ast.Call(func=function, args=args, keywords=keywords):
+                name = ast.unparse(function).rsplit(".", 1)[-1]
+                owner = [function.value] if isinstance(function, ast.Attribute) else []
+                given = [*args, *(keyword.value for keyword in keywords)]
+                if name in PASSED_ON:
+                    return [*owner, *given]
+                return [*self._definitions.read_returned(node), *(one for one in given if self._is_like(node, one))]
+        return []
+
+    def _list_appended(self, name: ast.Name) -> list[ast.expr]:
+        """Return what is appended to a list."""
+        found: list[ast.expr] = []
+        for node in ast.walk(self._series.source.find_function(name)):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="append" | "extend", value=ast.Name(id=text)), args=args) if (
+                    text == name.id
+                ):
+                    found += args
+        return found
+
+    def _is_like(self, whole: ast.expr, part: ast.expr) -> bool:
+        """Say whether a function returns as many elements as an argument has: it may add noise."""
+        sizes = [self._series.read(node, size=size) for node in (whole, part) for size in (2, 3)]
+        return any(one is not None and other is not None for one, other in zip(sizes[:2], sizes[2:], strict=True))
+
+
+def find_world_vectors(rule: Rule, turned: TurnedVectors, definitions: Definitions) -> Iterator[RuleFinding]:
+    """Yield the first vector of the world in an observation that has others in the frame of the robot, and does not
+    show its heading, with which episodes begin in all directions."""
+    series, turns, directions, world = turned.series, turned.turns, turned.directions, turned.world
+    observed = ObservedCode(series, definitions, turns)
+    if any(SEEN_WORDS & list_words(node) for node in observed.nodes):
+        return
+    inside = [entry for entry in turned.known if entry[0].whole.node in set(observed.nodes)]
+    backwards = [(turn, found[1]) for turn, found in inside if found is not None and found[0] < 0]
+    orientations = {one.text for one in series.orientations}
+    for turn, by in backwards:
+        yaw = directions.read_yaw(by)
+        is_of_world = world.is_gravity(turn.before) or observed.is_base_velocity(turn.part) or world.explain(turn)
+        if by in orientations and directions.has_engine and not world.has_free_base:
+            continue  # the gripper of an arm, whose joints tell its heading
+        if yaw is None or not is_of_world or not _begins_anywhere(series, yaw):
+            continue
+        if any(_shows(series, node, yaw) for node in observed.nodes):
+            return
+        for node in observed.nodes:
+            what = _explain(series, world, node, yaw, turns)
+            if observed.is_base_velocity(node):
+                what = "the velocity of the base"
+            one = series.source.find(node)
+            if what is not None and one is not None:
+                message = (
+                    f"{one.text}, {what}, is observed in the axes of the world, and {turn.whole.text} in the frame"
+                )
+                message += f" of the robot: nothing shows the heading, which is another one in each episode ({by})"
+                evidence = {"element": one.text, "value": by}
+                yield RuleFinding(rule, message, evidence, where=one.where, same=FRAME_RULES)
+                return
+
+
+def _begins_anywhere(series: VectorSeries, yaw: Array) -> bool:
+    firsts = [yaw[series.episodes == number][:2] for number in np.unique(series.episodes)]
+    known = np.array([rows[np.isfinite(rows)][0] for rows in firsts if np.isfinite(rows).any()])
+    return len(known) > 2 and float(np.ptp(np.angle(np.exp(1j * known)))) > WIDE
+
+
+def _shows(series: VectorSeries, node: ast.expr, yaw: Array) -> bool:
+    """Say whether a piece of code has the heading, its sine or its cosine, or an angle that changes as it does."""
+    rows = series.read(node)
+    if rows is None or len(rows) != len(yaw):
+        return False
+    steps = np.diff(series.episodes) == 0
+    angles = np.broadcast_to(yaw[:, :1], rows.shape)
+    known = np.isfinite(rows) & np.isfinite(angles)
+    if not known.any():
+        return False
+    turned = np.angle(np.exp(1j * np.diff(angles, axis=0)))[steps]
+    for sign in (1, -1):
+        changes = np.angle(np.exp(1j * sign * np.diff(rows, axis=0)))[steps]
+        same = np.abs(changes - turned) < SAME
+        moving = np.abs(turned) > 1e-4
+        if ((same & moving).sum(axis=0) > MOSTLY * np.maximum(moving.sum(axis=0), 1)).any():
+            return True
+    for wanted in (np.cos(angles), np.sin(angles), np.cos(angles / 2), np.sin(angles / 2)):
+        near = (np.abs(np.abs(rows) - np.abs(wanted)) < SAME) | ~known
+        if (near.all(axis=0) & known.any(axis=0)).any():
+            return True
+    lengths = np.linalg.norm(rows[np.isfinite(rows).all(axis=1)], axis=1)
+    is_orientation = rows.shape[1] in (4, 9) and np.abs(lengths - {4: 1, 9: 3}[rows.shape[1]] ** 0.5).max() < 1e-4
+    return bool(is_orientation)
+
+
+def _explain(
+    series: VectorSeries, world: WorldVectors, node: ast.expr, yaw: Array, turns: list[VectorTurn]
+) -> str | None:
+    """Return what a vector of the world is; None for others."""
+    for size in (2, 3):
+        rows = series.read(node, size=size)
+        one = series.source.find(node)
+        if rows is None or one is None or rows.shape[1] != yaw.shape[1] or not np.nanstd(rows, axis=0).any():
+            continue
+        if any(_is_same(turn.after, rows) for turn in turns) or any(node is turn.part for turn in turns):
+            return None
+        c, s = np.cos(yaw), np.sin(yaw)
+        turned = rows.copy()
+        turned[..., 0], turned[..., 1] = c * rows[..., 0] + s * rows[..., 1], c * rows[..., 1] - s * rows[..., 0]
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+            sides = [series.read(side, size=size) for side in (node.left, node.right)]
+            if any(side is not None and _is_same(turn.after, side) for side in sides for turn in turns):
+                return None
+            found = world.find_way(VectorTurn(one, node, one.text, rows, turned))
+            return None if found is None else "a way"
+        if world.is_velocity(VectorTurn(one, node, one.text, rows, turned)):
+            return "the velocity that moves a position"
+    return None
+
+
+def _is_same(one: Array, other: Array) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=1e-6, atol=1e-9, equal_nan=True)

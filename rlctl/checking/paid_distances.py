@@ -1,0 +1,104 @@
+"""Summands of a reward that rise with the distance to what is to be reached, whatever function they are of it."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.definitions import ReadExpression
+from rlctl.checking.expressions import NotedCall
+from rlctl.checking.forced_rewards import ForcedRewards
+from rlctl.checking.goal_distances import DistanceReader, GoalDistance
+from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.summands import Summand
+
+PARTS = (0.02, 0.25, 0.5, 0.75, 1.0, 1.5)  # of the largest distance that was noted
+LOW, HIGH = 0, 4  # of these parts
+EPISODES, LATER = (0, 3), (0, 3)  # that are played again, and steps in them
+LASTING = 3  # steps at one distance, in which there is no progress
+SAME, LEAST = 1e-3, 1e-6  # of a rise: how much it may differ between steps; of rewards: the least that counts
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RisingReward:
+    """What a step pays at a small and at a large distance."""
+
+    distance: GoalDistance
+    place: ReadExpression
+    name: str
+    near: tuple[float, float]  # the distance, and the reward
+    far: tuple[float, float]
+
+
+class RiseReader:
+    """Finds rewards that rise with a distance, in steps in which nothing else changes."""
+
+    def __init__(self, goals: GoalReader) -> None:
+        self.notes, self.goals = goals.notes, goals
+        self.forced = ForcedRewards(goals.notes)
+
+    def find_rises(self) -> Iterator[RisingReward]:
+        """Yield them."""
+        for one in DistanceReader(self.notes).distances:
+            if self._rises_first(one) and self._rises_everywhere(one):
+                found = self._describe(one)
+                if found is not None:
+                    yield found
+
+    def _pay(self, one: GoalDistance, number: int, last: int, part: float, lasting: int = LASTING) -> float:
+        return self.forced.pay(number, last, {one.expression.number: part * one.largest}, lasting)[0]
+
+    def _rises_first(self, one: GoalDistance) -> bool:
+        last = self.forced.find_last(EPISODES[0])
+        if last is None:
+            return False
+        near, far = (self._pay(one, EPISODES[0], last, PARTS[part]) for part in (LOW, HIGH))
+        return far > near + LEAST * max(1.0, abs(near))
+
+    def _rises_everywhere(self, one: GoalDistance) -> bool:
+        """Say whether the reward never falls with the distance, and rises by the same in each step of an episode."""
+        for number in EPISODES:
+            rises = []
+            for later in LATER:
+                last = self.forced.find_last(number, later)
+                if last is None:
+                    return False
+                paid = np.array([self._pay(one, number, last, part) for part in PARTS])
+                least = LEAST * max(1.0, float(np.abs(paid).max()))
+                if not np.isfinite(paid).all() or np.diff(paid).min() < -least or paid[HIGH] < paid[LOW] + least:
+                    return False
+                rises.append(paid[HIGH] - paid[LOW])
+            if np.ptp(rises) > SAME * max(rises):
+                return False
+        return True
+
+    def _describe(self, one: GoalDistance) -> RisingReward | None:
+        """Return where the reward rises; None where it falls if only the last distance is larger, as progress does, and
+        no summand of its own rises."""
+        number = EPISODES[0]
+        last = self.forced.find_last(number) or 0
+        distances = [PARTS[part] * one.largest for part in (LOW, HIGH)]
+        ends = [self.forced.pay(number, last, {one.expression.number: value}) for value in distances]
+        (near, before), (far, after) = ends
+        if before is None or after is None:
+            return None
+        rising = [summand for summand in one.summands if self._is_rising(summand, before, after)]
+        if far <= near and not rising:
+            return None
+        place = rising[0].place if rising else ReadExpression(one.expression.node, one.expression.function, {})
+        paid = [self._pay(one, number, last, PARTS[part]) for part in (LOW, HIGH)]
+        name = rising[0].name if rising else "the reward"
+        return RisingReward(one, place, name, (distances[0], paid[0]), (distances[1], paid[1]))
+
+    def _is_rising(self, summand: Summand, before: NotedCall, after: NotedCall) -> bool:
+        if math.isnan(summand.weight) or self.goals.is_of_progress(summand):
+            return False
+        noted = self.notes.source.find(summand.place.node)
+        if noted is None:
+            return False
+        near, far = (call.values.get(noted.number, [None])[-1] for call in (before, after))
+        if near is None or far is None or np.shape(near) != np.shape(far):
+            return False
+        rise = summand.weight * float(np.mean(np.subtract(far, near)))
+        return rise > LEAST * max(1.0, float(np.max(np.abs(near))))

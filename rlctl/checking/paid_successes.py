@@ -1,0 +1,137 @@
+"""Where a success pays less than steps that lack only a part of it: both are played, and the goal is near in both."""
+
+import ast
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.definitions import ReadExpression
+from rlctl.checking.forced_rewards import ForcedRewards
+from rlctl.checking.goal_distances import DistanceReader
+from rlctl.checking.paid_goals import GoalReader
+
+PARTS = (0.03, 0.06, 0.12, 0.25)  # of the largest distance to the goal that was noted
+EPISODES = (0, 3)  # that are played again
+LASTING = 2  # steps at one distance, in which there is no progress
+CLEARLY, LEAST = 0.02, 1e-6  # part of the rewards, by which success pays less
+MOST_FLAGS = 5
+Flags = dict[int, bool]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LowSuccess:
+    """What a success pays, and what a step pays before it."""
+
+    place: ReadExpression  # of what tells success
+    paid: ReadExpression  # of what is paid for it
+    success: float
+    before: float
+    lacks: str  # what is not true before it, besides success; may be empty
+
+
+class SuccessReader:
+    """Compares them."""
+
+    def __init__(self, goals: GoalReader) -> None:
+        self.notes, self.goals, self.definitions = goals.notes, goals, goals.definitions
+        self.forced = ForcedRewards(goals.notes)
+        self.distances = {one.expression.number: one.largest for one in DistanceReader(goals.notes).distances}
+
+    def find(self) -> LowSuccess | None:
+        """Return a success that pays less in each episode that is looked at."""
+        place = self.goals.read_success()
+        number = self._find_number(place) if place is not None else None
+        if place is None or number is None or not self._decides(place):
+            return None
+        found: LowSuccess | None = None
+        for episode in EPISODES:
+            found = self._compare(episode, place)
+            if found is None:
+                break
+        return found
+
+    def _decides(self, place: ReadExpression) -> bool:
+        """Say whether the reward is another one where success is told otherwise."""
+        last = self.forced.find_last(EPISODES[0])
+        if last is None:
+            return False
+        paid = [self._pay(EPISODES[0], last, {}, dict.fromkeys(self._list_same(place), told)) for told in (False, True)]
+        return all(map(math.isfinite, paid)) and paid[0] != paid[1]
+
+    def _find_number(self, place: ReadExpression) -> int | None:
+        one = self.notes.source.find(place.node)
+        return one.number if one is not None else None
+
+    def _find_paid(self, place: ReadExpression) -> ReadExpression:
+        for one in self.goals.reward.summands:
+            if any(is_true and self.goals.is_success(test, one.place) for test, is_true in one.conditions):
+                return one.place
+        return place
+
+    def _list_same(self, place: ReadExpression) -> list[int]:
+        """Return the numbers of an expression, wherever it is written in its function."""
+        text = ast.unparse(place.node)
+        return [
+            one.number
+            for one in self.notes.source.expressions
+            if one.function is place.function and one.node.lineno >= place.node.lineno and one.text == text
+        ]
+
+    def _list_flags(self) -> list[tuple[str, Flags]]:
+        """Return what is true of a success besides distances, each with its expressions and what these are then."""
+        flags: list[tuple[str, Flags]] = []
+        for part in self.goals.success_parts[1:]:
+            inner, is_met, found = part, True, dict.fromkeys(self._list_same(part), True)
+            while isinstance(inner.node, ast.UnaryOp) and isinstance(inner.node.op, ast.Not):
+                is_met = not is_met
+                inner = self.definitions.resolve(inner.at(inner.node.operand))
+                found |= dict.fromkeys(self._list_same(inner), is_met)
+            is_and = isinstance(part.node, ast.BoolOp) and isinstance(part.node.op, ast.And)
+            nodes = {place.node for place in self.definitions.walk(part)}
+            numbers = {one.number for node in nodes if (one := self.notes.source.find(node)) is not None}
+            if found and not is_and and not numbers & self.distances.keys():
+                flags.append((ast.unparse(part.node), found))
+        return flags[:MOST_FLAGS]
+
+    def _compare(self, episode: int, place: ReadExpression) -> LowSuccess | None:
+        last = self.forced.find_last(episode)
+        if last is None:
+            return None
+        success = dict.fromkeys(self._list_same(place), True)
+        flags = self._list_flags()
+        met = {number: value for _, one in flags for number, value in one.items()}
+        best, before, lacks = -math.inf, -math.inf, ""
+        for part in PARTS if self.distances else PARTS[:1]:
+            near = {number: part * largest for number, largest in self.distances.items()}
+            best = max(best, self._pay(episode, last, near, met | success))
+            for text, without in self._list_failures(flags, met, success):
+                is_natural = not text and self._succeeds(episode, last, near, place)
+                paid = -math.inf if is_natural else self._pay(episode, last, near, without)
+                if paid > before:
+                    before, lacks = paid, text
+        least = max(LEAST, CLEARLY * max(abs(best), abs(before)))
+        is_known = math.isfinite(best) and math.isfinite(before)
+        return (
+            LowSuccess(place, self._find_paid(place), best, before, lacks)
+            if is_known and before > best + least
+            else None
+        )
+
+    def _list_failures(self, flags: list[tuple[str, Flags]], met: Flags, success: Flags) -> Iterator[tuple[str, Flags]]:
+        """Yield what is true of steps without a success: nothing that is known, or all but one flag."""
+        failure = dict.fromkeys(success, False)
+        yield "", failure
+        for text, one in flags:
+            yield text, met | {number: not value for number, value in one.items()} | failure
+
+    def _pay(self, episode: int, last: int, near: dict[int, float], flags: Flags) -> float:
+        paid = self.forced.pay(episode, last, near, LASTING, flags)[0]
+        return paid if math.isfinite(paid) else -math.inf
+
+    def _succeeds(self, episode: int, last: int, near: dict[int, float], place: ReadExpression) -> bool:
+        """Say whether this is a success at such distances; or the episode ends before, as it does at one."""
+        noted = self.forced.pay(episode, last, near, LASTING)[1]
+        values = noted.values.get(self._find_number(place) or 0, []) if noted is not None else [1.0]
+        return any(value is not None and bool(np.any(value)) for value in values)

@@ -1,0 +1,140 @@
+"""In which direction the source turns vectors, by the orientations that it reads."""
+
+import ast
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from rlctl.checking.attitudes import compute_matrices
+from rlctl.checking.expressions import Expression, NotedCall, Value
+from rlctl.checking.turned_expressions import VectorTurn
+from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries, list_words
+
+INVERSE_WORDS = {"inv", "inverse", "invert", "conj", "conjugate", "transpose"}
+ANGLE_WORDS = {"yaw", "heading", "theta", "psi", "course", "euler", "rpy", "joint", "joints", "angle", "qpos", "turn"}
+WXYZ, XYZW = [1, 2, 3, 0], [0, 1, 2, 3]
+"""Where the elements x, y, z and w are."""
+MOST_CALLS = 60  # in which orientations are compared
+LEAST_SPREAD = 0.1  # of an angle [rad], standard deviation
+
+
+class Directions:
+    """In which direction vectors are turned, by the orientations that the source reads."""
+
+    def __init__(self, series: VectorSeries) -> None:
+        self.series = series
+        nodes = (node for tree in series.source.trees.values() for node in ast.walk(tree))
+        imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
+        self._libraries = {word for node in imports for word in ast.unparse(node).replace(".", " ").split()}
+        self.has_engine = bool(self._libraries & {"mujoco", "pybullet", "rlctl"})
+
+    def find(self, turn: VectorTurn) -> tuple[int, str] | None:
+        """Return 1 for a turn from the body to the world, -1 for the inverse, and by what; None where it is not
+        known."""
+        if turn.before.shape[2] == 3 and (found := self._find_by_quaternions(turn)):
+            return found
+        flat = turn.before.shape[2] == 2 or np.allclose(turn.before[..., 2], turn.after[..., 2], equal_nan=True)
+        return self._find_by_angles(turn) if flat else None
+
+    def _choose_calls(self, turn: VectorTurn) -> list[int]:
+        known = np.isfinite(turn.before).all(axis=(1, 2)) & np.isfinite(turn.after).all(axis=(1, 2))
+        lengths = np.linalg.norm(np.nan_to_num(turn.before), axis=-1).max(axis=1)
+        moved = np.linalg.norm(np.nan_to_num(turn.after - turn.before), axis=-1).max(axis=1) > 1e-3 * lengths
+        usable = np.flatnonzero(known & moved & (lengths > SAME))
+        return usable[:: max(1, len(usable) // MOST_CALLS)].tolist()
+
+    def _find_by_quaternions(self, turn: VectorTurn) -> tuple[int, str] | None:
+        calls, found = self._choose_calls(turn), list[tuple[int, int, str]]()
+        for one in self.series.orientations if len(calls) >= FEWEST else ():
+            for order in (WXYZ, XYZW):
+                hits = np.zeros(2)
+                for number, place in enumerate(calls):
+                    hits += self._compare(turn, place, _list_values(self.series.calls[place], one), order)
+                    if number == FEWEST // 2 and not hits.any():
+                        break
+                for sign, hit, other in ((1, 0, 1), (-1, 1, 0)):
+                    if hits[hit] >= NEARLY_ALL * len(calls) and hits[other] <= HARDLY_ANY * len(calls):
+                        found.append((_rank(one), sign, one.text))
+        return _choose(found)
+
+    def _compare(self, turn: VectorTurn, place: int, orientations: Sequence[Value], order: Sequence[int]) -> Array:
+        before, after = turn.before[place], turn.after[place]
+        hits = np.zeros(2)
+        for value in orientations:
+            elements = np.zeros(0) if value is None else np.asarray(value, float)
+            if elements.size == 9:
+                matrices = elements.reshape(1, 3, 3)
+            elif elements.shape in ((4,), (len(before), 4)):
+                matrices = compute_matrices(elements.reshape(-1, 4)[:, order])
+            else:
+                continue
+            for side, turned in enumerate(
+                (np.einsum("nij,nj->ni", matrices, before), np.einsum("nji,nj->ni", matrices, before))
+            ):
+                near = np.linalg.norm(turned - after, axis=1) <= 1e-5 * np.linalg.norm(before, axis=1)
+                hits[side] = max(hits[side], float(near.all()))
+        return hits
+
+    def _find_by_angles(self, turn: VectorTurn) -> tuple[int, str] | None:
+        x, y = turn.before[..., 0], turn.before[..., 1]
+        u, v = turn.after[..., 0], turn.after[..., 1]
+        angles = np.arctan2(x * v - y * u, x * u + y * v)
+        usable = np.isfinite(angles) & (np.hypot(x, y) > 1e-3)
+        if usable.sum() < FEWEST:
+            return None
+        found = []
+        for one, rows in self._angles:
+            if rows.shape[1] not in (1, angles.shape[1]):
+                continue
+            known = np.broadcast_to(rows, angles.shape)
+            both = usable & np.isfinite(known)
+            if both.sum() < max(FEWEST, 0.5 * usable.sum()) or np.std(known[both]) < LEAST_SPREAD:
+                continue
+            hits = [float((np.abs(np.sin((angles - sign * known)[both] / 2)) < 1e-5).mean()) for sign in (1, -1)]
+            for sign, hit, other in ((1, 0, 1), (-1, 1, 0)):
+                if hits[hit] >= NEARLY_ALL and hits[other] <= HARDLY_ANY:
+                    found.append((_rank(one), sign, one.text))
+        return _choose(found)
+
+    def read_yaw(self, text: str) -> Array | None:
+        """Return the angle about the vertical of an orientation that `find` has named: (calls, worlds)."""
+        for one in (one for one in self.series.orientations if one.text == text):
+            if (matrices := self.series.read_matrices(one)) is not None:
+                return np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])[:, None]
+            rows = self.series.read(one.node, size=4)
+            if rows is not None:
+                order = WXYZ if "mujoco" in self._libraries else XYZW
+                yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
+                return yaw.reshape(rows.shape[:2])
+        angles = [rows for one, rows in self._angles if one.text == text]
+        return max(angles, key=lambda rows: np.isfinite(rows).sum(), default=None)  # some are read at resets only
+
+    @functools.cached_property
+    def _angles(self) -> list[tuple[Expression, Array]]:
+        """What is called an angle about the vertical, and is no argument: that may be another one's opposite."""
+        kinds = ast.Name | ast.Attribute | ast.Subscript | ast.Call
+        named = [one for one in self.series.source.expressions if isinstance(one.node, kinds)]
+        named = [one for one in named if list_words(one.node) & ANGLE_WORDS and _rank(one) < 2]
+        found = [(one, self.series.read(one.node)) for one in named]
+        return [(one, rows) for one, rows in found if rows is not None]
+
+
+def _choose(found: Sequence[tuple[int, int, str]]) -> tuple[int, str] | None:
+    """Return the direction by the best of some orientations; None where these do not agree."""
+    best = [entry for entry in found if entry[0] == min(found)[0]]
+    return (best[0][1], best[0][2]) if len({sign for _, sign, _ in best}) == 1 else None
+
+
+def _rank(one: Expression) -> int:
+    """Return 0 for what is stored, 1 for what is read, and 2 for what may be the inverse of an orientation."""
+    parameters = {argument.arg for argument in one.function.args.args} - {"self"}
+    names = {node.id for node in ast.walk(one.node) if isinstance(node, ast.Name)}
+    if names & parameters or list_words(one.node) & INVERSE_WORDS or isinstance(one.node, ast.BinOp | ast.UnaryOp):
+        return 2
+    return 0 if isinstance(one.node, ast.Attribute | ast.Subscript) and "self" in names else 1
+
+
+def _list_values(call: NotedCall, one: Expression) -> list[Value]:
+    values = call.values.get(one.number, [])
+    return values if len(values) <= 3 else [values[0], *values[-2:]]

@@ -1,0 +1,120 @@
+"""Where the source turns a vector."""
+
+import ast
+import collections
+import dataclasses
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.expressions import Expression
+from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries
+
+LEAST_TURN = 0.002  # of a vector's length, that a turn moves it
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VectorTurn:
+    """An expression that turns a vector: (calls, worlds, elements)."""
+
+    whole: Expression
+    part: ast.expr | None  # the vector; None where it has only elements
+    text: str  # of the vector
+    before: Array
+    after: Array
+
+    @property
+    def turned_back(self) -> "VectorTurn":
+        """The opposite turn."""
+        return dataclasses.replace(self, before=self.after, after=self.before)
+
+
+def find_turns(series: VectorSeries) -> Iterator[VectorTurn]:
+    """Yield the expressions whose value is as long as one of its operands or arguments, and another vector."""
+    for one in series.source.expressions:
+        parts: list[ast.expr] = []
+        match one.node:
+            case ast.BinOp(left=left, op=ast.MatMult(), right=right):
+                parts = [left, right]
+            case ast.Call(args=args, keywords=keywords, func=function):
+                parts = [*args, *(keyword.value for keyword in keywords)]
+                parts += [function.value] if isinstance(function, ast.Attribute) else []
+        for part, size in itertools.product(parts, (2, 3)):
+            before, after = series.read(part, size=size), series.read(one.node, size=size)
+            if before is not None and after is not None and _is_turn(before, after):
+                yield VectorTurn(one, part, ast.unparse(part), before, after)
+    yield from _find_written_out(series)
+
+
+def _is_turn(before: Array, after: Array) -> bool:
+    if before.shape != after.shape:
+        return False
+    both = np.isfinite(before).all(axis=2) & np.isfinite(after).all(axis=2)
+    old, new = before[both], after[both]
+    lengths = np.linalg.norm(old, axis=-1)
+    if (lengths > SAME).sum() < FEWEST:
+        return False
+    same = np.abs(np.linalg.norm(new, axis=-1) - lengths) <= SAME * (1e-3 + lengths)
+    moved = np.linalg.norm(new - old, axis=-1) > LEAST_TURN * lengths
+    return bool(same.mean() > NEARLY_ALL and moved[lengths > SAME].mean() > HARDLY_ANY)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sum:
+    """A sum of two products of two factors."""
+
+    one: Expression
+    factors: tuple[tuple[ast.expr, ast.expr], tuple[ast.expr, ast.expr]]
+
+
+def _find_written_out(series: VectorSeries) -> Iterator[VectorTurn]:
+    """Yield turns in the plane that are written by elements: c * x - s * y and s * x + c * y."""
+    sums: dict[ast.AST, list[_Sum]] = collections.defaultdict(list)
+    for one in series.source.expressions:
+        match one.node:
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+                products = [_read_product(left), _read_product(right)]
+                if products[0] is not None and products[1] is not None:
+                    sums[one.function].append(_Sum(one, (products[0], products[1])))
+    for function, found in sums.items():
+        parameters = {argument.arg for argument in function.args.args} - {"self"}  # type: ignore[attr-defined]
+        for first, second in itertools.pairwise(found):
+            turn = _read_pair(series, first, second, parameters)
+            if turn is not None and _is_turn(turn.before, turn.after):
+                yield turn
+
+
+def _read_product(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
+    if isinstance(node, ast.UnaryOp):
+        node = node.operand
+    if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Mult):
+        return None
+    one = node.left.operand if isinstance(node.left, ast.UnaryOp) else node.left
+    return one, node.right
+
+
+def _read_pair(series: VectorSeries, first: _Sum, second: _Sum, parameters: set[str]) -> VectorTurn | None:
+    """Return the turn that two sums are: one factor of each product is a cosine or a sine, the other an element."""
+    others = [{ast.unparse(node) for node in product} for product in second.factors]
+    for flips in itertools.product((0, 1), repeat=2):
+        (a, x), (b, y) = (
+            product[::-1] if flip else product for product, flip in zip(first.factors, flips, strict=True)
+        )
+        names = [ast.unparse(node) for node in (a, x, b, y)]
+        crossed = [{names[0], names[3]}, {names[2], names[1]}]
+        if others not in (crossed, crossed[::-1]):
+            continue
+        values = [series.read(node) for node in (a, b, x, y, first.one.node, second.one.node)]
+        if any(value is None for value in values):
+            continue
+        cosine, sine, *vectors = np.broadcast_arrays(*values)  # type: ignore[arg-type]
+        known = np.isfinite(cosine) & np.isfinite(sine)
+        if not known.any() or np.abs(cosine[known] ** 2 + sine[known] ** 2 - 1).max() > SAME:
+            continue
+        roots = {node.id for part in (x, y) for node in ast.walk(part) if isinstance(node, ast.Name)}
+        if roots & parameters:  # those who call the function show which vector it is
+            return None
+        before, after = np.stack(vectors[:2], -1), np.stack(vectors[2:], -1)
+        return VectorTurn(first.one, None, f"({names[1]}, {names[3]})", before, after)
+    return None

@@ -1,0 +1,86 @@
+"""What the expressions of a source that are vectors are worth, call by call."""
+
+import ast
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlctl.checking.expressions import Expression, NotedCall, SourceCode
+from rlctl.checking.term_names import split_name
+
+Array = NDArray[np.float64]
+
+MATRIX_WORDS = {"xmat", "site_xmat", "geom_xmat", "ximat"}
+SAME = 1e-6
+FEWEST, NEARLY_ALL, MOSTLY, HARDLY_ANY = 10, 0.95, 0.7, 0.3
+
+
+class VectorSeries:
+    """What each expression that is a vector was worth at the end of each call: (calls, worlds, elements)."""
+
+    def __init__(self, source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) -> None:
+        self.source = source
+        self.calls = [call for episode in episodes for call in episode]
+        self.episodes = np.concatenate([np.full(len(one), number) for number, one in enumerate(episodes)])
+        self._last = [{number: values[-1] for number, values in call.values.items()} for call in self.calls]
+
+    @functools.cache  # noqa: B019  # lives as long as one experiment
+    def read(self, node: ast.AST, *, size: int | None = None) -> Array | None:
+        """Return the last values of an expression, NaN where it was not evaluated; numbers are of (calls, worlds)."""
+        one = self.source.find(node)
+        if one is None:
+            return None
+        values = [last.get(one.number) for last in self._last]
+        shapes = {np.shape(value) for value in values if value is not None}
+        if len(shapes) != 1:
+            return None
+        shape = shapes.pop()
+        rows = np.full((len(values), *shape), np.nan)
+        for place, value in enumerate(values):
+            if value is not None:
+                rows[place] = value
+        if size is None:
+            return rows.reshape(len(rows), -1) if len(shape) <= 1 else None
+        if not shape or shape[-1] != size or len(shape) > 2:
+            return None
+        return rows.reshape(len(rows), -1, size)
+
+    @functools.cached_property
+    def vectors(self) -> list[tuple[Expression, Array]]:
+        """All expressions of two or three elements."""
+        found = [(one, self.read(one.node, size=size)) for one in self.source.expressions for size in (2, 3)]
+        return [(one, rows) for one, rows in found if rows is not None]
+
+    @functools.cached_property
+    def orientations(self) -> list[Expression]:
+        """All expressions that are unit quaternions, and change; and MuJoCo's matrices."""
+        found = [one for one in self.source.expressions if MATRIX_WORDS & list_words(one.node) and self._is_matrix(one)]
+        for one in self.source.expressions:
+            rows = self.read(one.node, size=4)
+            if rows is not None and np.isfinite(rows).any():
+                lengths = np.linalg.norm(rows[np.isfinite(rows).all(axis=2)], axis=-1)
+                moves = np.nanstd(rows, axis=(0, 1)).max()
+                if len(lengths) >= FEWEST and np.abs(lengths - 1).max() < 1e-4 and moves > SAME:
+                    found.append(one)
+        return found
+
+    def read_matrices(self, one: Expression) -> Array | None:
+        """Return the matrices of an expression that has nine elements, (calls, 3, 3); None for others."""
+        if not self._is_matrix(one):
+            return None
+        values = [last.get(one.number) for last in self._last]
+        return np.array([np.full(9, np.nan) if v is None else np.ravel(v) for v in values]).reshape(-1, 3, 3)
+
+    def _is_matrix(self, one: Expression) -> bool:
+        values = [last[one.number] for last in self._last if one.number in last]
+        return len(values) >= FEWEST and all(np.size(value) == 9 for value in values if value is not None)
+
+
+def list_words(node: ast.AST) -> set[str]:
+    """Return the words of all names in a piece of code."""
+    names = [one.id for one in ast.walk(node) if isinstance(one, ast.Name)]
+    names += [one.attr for one in ast.walk(node) if isinstance(one, ast.Attribute)]
+    names += [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+    return {word for name in names for word in split_name(name)}

@@ -1,0 +1,62 @@
+"""Where the source turns a vector of the world by an orientation itself, instead of its inverse."""
+
+from collections.abc import Iterator
+
+from rlctl.checking.rule import Rule, RuleFinding
+from rlctl.checking.turn_directions import Directions
+from rlctl.checking.turned_expressions import find_turns
+from rlctl.checking.vector_series import VectorSeries, list_words
+from rlctl.checking.world_vectors import WorldVectors
+
+WORLD_WORDS = {"world", "global", "inertial", "map"}
+FRAME_RULES = ("RL123", "RL124", "RL125", "RL127", "RL128", "RL129")
+"""The rules that find vectors in wrong frames by what is observed and paid."""
+
+
+class TurnedVectors:
+    """All turns of vectors in a source, with their directions."""
+
+    def __init__(self, series: VectorSeries) -> None:
+        self.series, self.directions, self.world = series, Directions(series), WorldVectors(series)
+        self.turns = list(find_turns(series))
+        self.known = [(turn, self.directions.find(turn)) for turn in self.turns]
+
+
+def find_mixed_frames(rule: Rule, turned: TurnedVectors) -> Iterator[RuleFinding]:
+    """Yield the axes of the body, turned by the inverse, that are multiplied with a vector of the world."""
+    rights_3d = {one.text for one in turned.series.orientations}
+    for turn, found in turned.known:
+        if found is None or found[0] >= 0 or found[1] not in rights_3d:
+            continue
+        other = turned.world.find_compared(turn)
+        if other is not None:
+            message = (
+                f"{turn.whole.text} turns {turn.text} by the inverse of {found[1]}, from the world to the body, and"
+            )
+            message += f" it is multiplied with {other}, which is of the world"
+            yield RuleFinding(rule, message, {"element": turn.whole.text, "value": turn.text}, where=turn.whole.where)
+
+
+def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Iterator[RuleFinding]:
+    """Yield the turns of vectors of the world by the orientation itself, instead of its inverse: of the ways to places,
+    or of all others."""
+    series, directions, world = turned.series, turned.directions, turned.world
+    explained = [(turn, found, world.explain(turn)) for turn, found in turned.known if found is not None]
+    rights = {found[1] for _, found, what in explained if found[0] < 0 and what is not None}
+    rights |= {found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)}
+    seen, rights_3d = set[int](), {one.text for one in series.orientations}
+    for turn, (sign, by), what in explained:
+        if sign < 0 or what is None or turn.whole.number in seen:
+            continue
+        is_angle = turn.before.shape[2] == 2 or by not in rights_3d
+        is_told = bool(list_words(turn.whole.node) & WORLD_WORDS) or by in rights or directions.has_engine
+        if is_angle and not is_told:
+            continue  # the angle may count the other way round, as that of a compass
+        seen.add(turn.whole.number)
+        if what.startswith("the way") == of_ways:
+            message = (
+                f"{turn.whole.text} turns {turn.text}, {what}, by the orientation {by}: from the body to the world,"
+            )
+            message += " and the vector is one of the world already"
+            evidence = {"element": turn.whole.text, "value": turn.text}
+            yield RuleFinding(rule, message, evidence, where=turn.whole.where, same=FRAME_RULES)

@@ -1,0 +1,92 @@
+"""Signs, indices and bonuses that are wrong in the source of the reward."""
+
+import numpy as np
+import pytest
+
+from rlctl.checking.experiments.expressions import noted_episodes
+from rlctl.checking.instance import Budget, Context
+from rlctl.checking.paid_commands import CommandReader
+from rlctl.checking.paid_errors import ErrorReader
+from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.progress import read_clock
+from rlctl.environments.spec import EnvSpec
+from tests.checking.judging import FOLDER, case, check_case, mark_slow
+
+pytest.importorskip("mujoco")
+FILE = "broken_paid.py"
+
+
+def broken(name, twin):
+    return case(f"{FILE}:{name}", (name[:5], "warning"), twin=f"{FILE}:{twin}", slow=True)
+
+
+CASES = [
+    broken("RL634SkidRaces", "Skid"),
+    broken("RL630SkidSavesInReverse", "Skid"),
+    broken("RL632SkidTurnsAsItDrives", "Skid"),
+    broken("RL635SkidRolls", "Skid"),
+    broken("RL622DockerFlees", "Docker"),
+    broken("RL622DockerIsNearAtACost", "Docker"),
+    broken("RL620DockerComparesWithItself", "Docker"),
+    broken("RL605DockerWaits", "Docker"),
+    broken("RL640RoverIsUpright", "RoverIsSlow"),
+]
+
+
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+def note(name):
+    context = Context(EnvSpec(f"{FOLDER / FILE}:{name}"))
+    context.budget = Budget(read_clock() + 60.0)
+    with noted_episodes(context) as noted:
+        return noted
+
+
+def test_the_summands_of_a_weighted_loop_have_names_and_weights():
+    summands = note("Skid").reward.summands
+    assert [(one.name, one.weight) for one in summands] == [
+        ("0.0", 1.0),
+        ("track_speed", 1.0),
+        ("track_speed", -1.0),
+        ("track_turn", 0.5),
+        ("drive", -0.02),
+    ]
+
+
+def test_the_summands_of_a_step_add_up_to_its_reward():
+    notes = note("Docker")
+    paid = [one for one in notes.reward.summands if not one.conditions]
+    parts = [one.weight * notes.reward.numbers.list_values(one.place.node) for one in paid]
+    steps = len(notes.steps)
+    total = sum(np.broadcast_to(part, steps) for part in parts)
+    noted = [(one.text, notes.reward.numbers.list_values(one.node)) for one in notes.source.expressions]
+    by_text = {text: values for text, values in noted if values.size}
+    assert np.allclose(total + 10 * by_text["bool(gap < 0.1)"], by_text["float(reward)"])
+
+
+@pytest.mark.parametrize(
+    ("name", "find"),
+    [
+        ("RL634SkidRaces", lambda notes: ErrorReader(notes).find_errors()),
+        ("RL630SkidSavesInReverse", lambda notes: ErrorReader(notes).find_sums()),
+        ("RL632SkidTurnsAsItDrives", lambda notes: CommandReader(notes).find_unpaid()),
+        ("RL635SkidRolls", lambda notes: CommandReader(notes).find_other_axes()),
+        ("RL622DockerFlees", lambda notes: GoalReader(notes).find_wrong_signs()),
+        ("RL622DockerIsNearAtACost", lambda notes: GoalReader(notes).find_wrong_signs()),
+    ],
+)
+def test_the_source_alone_shows_the_mistake(name, find):
+    assert list(find(note(name)))
+    assert not list(find(note("Docker" if "Docker" in name else "Skid")))
+
+
+def test_what_success_pays_is_less_than_the_steps_next_to_it():
+    waits, sound = GoalReader(note("RL605DockerWaits")), GoalReader(note("Docker"))
+    assert waits.ends_at_success()
+    assert sound.ends_at_success()
+    assert (waits.read_bonus(), sound.read_bonus()) == (10.0, 10.0)
+    assert waits.read_income() == pytest.approx(0.52)
+    assert sound.read_income() == pytest.approx(-0.03)
