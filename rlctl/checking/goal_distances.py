@@ -92,14 +92,15 @@ class DistanceReader:
         return [(one, {place.node for place in self.definitions.walk(one.place)}) for one in reward.summands]
 
     def _read_sides(self, place: ReadExpression) -> tuple[ReadExpression, ReadExpression] | None:
-        """Return the two things whose distance is measured; None where it is none, or where it is a function's own
+        """Return the two things whose distance is measured; None where there are none, or a function returns it of its
         parameters: those are known where it is called."""
         returned = self.definitions.list_returned(place)
         if len(returned) == 1 and isinstance(returned[0].node, ast.Call | ast.BinOp):
             sides = self._read_length(returned[0])
             return sides if sides and any(_is_parameter(side) for side in sides) else None
         sides = self._read_length(place)
-        return None if sides is None or any(_is_parameter(side) for side in sides) else sides
+        is_named = isinstance(self.notes.source.find_statement(place.node), ast.Assign)
+        return None if sides is None or (any(map(_is_parameter, sides)) and not is_named) else sides
 
     def _read_length(self, place: ReadExpression) -> tuple[ReadExpression, ReadExpression] | None:
         while isinstance(place.node, ast.Call) and read_name(place.node.func) in ("float", "item", "abs"):

@@ -31,8 +31,10 @@ class Biped(gym.Env):
         "RL804": "it stretches its legs as far as they go",
     }
 
+    xml = MODEL
+
     def __init__(self):
-        self.model = mujoco.MjModel.from_xml_string(MODEL)
+        self.model = mujoco.MjModel.from_xml_string(self.xml)
         self.data = mujoco.MjData(self.model)
         self.ground = self.model.geom("ground").id
         self.feet = self.find_feet()
@@ -93,3 +95,7 @@ class RL835BipedLeftTwice(Biped):
 class RL835BipedTwoOfTheRight(Biped):
     def find_feet(self):
         return [self.model.geom("right_foot").id, self.model.geom("right_foot").id]
+
+
+class RL840BipedDrivesLeftTwice(Biped):
+    xml = MODEL.replace('<motor joint="right"', '<motor joint="left"')

@@ -1,4 +1,4 @@
-"""RL124, RL125, RL129, RL701, RL834 and RL835 by lines: vectors that are turned, elements read, and ids compared."""
+"""RL124, RL125, RL129, RL701, RL834, RL835, RL840: vectors that are turned, elements read, ids compared, by lines."""
 
 import pytest
 
@@ -38,6 +38,7 @@ CASES += [
 CASES += [
     case(f"broken_ids.py:{name}", (name[:5], "warning"), twin="broken_ids.py:Biped", slow=True) for name in COMPARED
 ]
+CASES += [case("broken_ids.py:RL840BipedDrivesLeftTwice", ("RL840", "warning"), twin="broken_ids.py:Biped")]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
