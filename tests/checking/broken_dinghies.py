@@ -8,6 +8,8 @@ from gymnasium import spaces
 class Dinghy(gym.Env):
     """It sails to a mark; a dictionary, with noise, is its observation."""
 
+    rlctl_ignore = {"RL609": "it has no goal"}
+
     def __init__(self):
         self.action_space = spaces.Box(-1, 1, (3,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (7,), np.float32)
