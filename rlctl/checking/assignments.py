@@ -5,7 +5,7 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 
-from rlctl.checking.expressions import Function, walk_own
+from rlctl.checking.source_code import Function, walk_own
 from rlctl.checking.term_names import split_name
 
 CONVERSIONS = {
@@ -159,10 +159,35 @@ def read_key(node: ast.expr) -> str:
             return f"{key}.{name}" if key else ""
         case ast.Subscript(value=owner, slice=ast.Constant(value=str(name))):
             key = read_key(owner)
-            return f"{key}.{name}" if key else name if isinstance(owner, ast.Name) else ""
+            if not key:
+                return name if isinstance(owner, ast.Name) else ""
+            return f"{key}.{name}"
         case ast.Subscript(value=owner):
             return read_key(owner)
     return ""
+
+
+def list_words(node: ast.AST) -> set[str]:
+    """Return the words of all names and texts in a piece of code."""
+    texts = [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+    return list_name_words(node) | {word for text in texts for word in split_name(text)}
+
+
+def list_name_words(node: ast.AST) -> set[str]:
+    """Return the words of all names in a piece of code, also of those in brackets: `state["goal"]`."""
+    names = [read_name(one) for one in ast.walk(node) if isinstance(one, ast.Name | ast.Attribute | ast.Subscript)]
+    return {word for name in names for word in split_name(name)}
+
+
+def list_parameters(function: Function) -> list[str]:
+    """Return the names of what a function is given by place, without the object of a method."""
+    names = [one.arg for one in [*function.args.posonlyargs, *function.args.args]]
+    return names[1:] if names[:1] in (["self"], ["cls"]) else names
+
+
+def list_returned(function: Function) -> list[ast.expr]:
+    """Return what a function returns, where it returns something."""
+    return [one.value for one in ast.walk(function) if isinstance(one, ast.Return) and one.value is not None]
 
 
 def read_words(key: str) -> set[str]:

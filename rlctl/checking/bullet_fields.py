@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import Definitions
-from rlctl.checking.expressions import Function
 from rlctl.checking.noted_numbers import NotedNumbers
+from rlctl.checking.source_code import Function
 from rlctl.checking.term_names import split_name
 
 PLACE, TURN = {"pos", "position", "positions"}, {"orn", "orientation", "quat", "quaternion"}

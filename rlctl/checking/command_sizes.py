@@ -7,14 +7,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.assignments import CONVERSIONS, Assignment, read_name
+from rlctl.checking.assignments import CONVERSIONS, Assignment, list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, PART, ErrorReader, Numbers, has_both_signs
 from rlctl.checking.products import list_product
 from rlctl.checking.summands import Summand
-from rlctl.checking.term_names import split_name
 
 SIZES = {"norm", "hypot", "abs", "absolute", "fabs", "square", "sqrt"}
 SAME_SIGN = CONVERSIONS | {"sum", "mean", "max", "min", "clip", "round"}
@@ -48,7 +47,7 @@ class SizeReader:
 
     def __init__(self, notes: NotedEpisodes) -> None:
         self.notes, self.reward = notes, notes.reward
-        self.errors, self.definitions = ErrorReader(notes), notes.reward.definitions
+        self.errors, self.definitions = notes.share(ErrorReader), notes.reward.definitions
         self._lengths: list[ast.expr] = []
 
     def find_one_sided(self) -> Iterator[OneSided]:
@@ -71,8 +70,7 @@ class SizeReader:
                 case ast.BinOp(left=left, op=ast.Sub(), right=right):
                     sides = [one.at(left), one.at(right)]
                     wanted = [self.errors.is_wanted(side) for side in sides]
-                    words = {word for part in ast.walk(one.node) for word in split_name(read_name(part))}  # type: ignore[arg-type]
-                    if sum(wanted) == 1 and not words & EARLIER_WORDS:
+                    if sum(wanted) == 1 and not list_name_words(one.node) & EARLIER_WORDS:
                         yield one, sides[wanted.index(True)], sides[wanted.index(False)]
 
     def _is_never_negative(self, place: ReadExpression, seen: set[tuple[object, str]]) -> bool:

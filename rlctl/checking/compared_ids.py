@@ -4,15 +4,17 @@ import ast
 import collections
 from collections.abc import Collection, Iterator, Sequence
 
-from rlctl.checking.assignments import CONVERSIONS
+from rlctl.checking.assignments import CONVERSIONS, read_name
+from rlctl.checking.bullet_fields import DISTANCE, BulletFields
 from rlctl.checking.definitions import Definitions
-from rlctl.checking.expressions import NotedCall, SourceCode
+from rlctl.checking.expressions import NotedCall
 from rlctl.checking.rule import Rule, RuleFinding
+from rlctl.checking.source_code import SourceCode
 from rlctl.checking.term_names import split_name
 
 KINDS = {"geom": "geom", "body": "body", "joint": "joint", "jnt": "joint", "site": "site", "actuator": "actuator"}
 LOADERS = {"loadURDF", "createMultiBody", "loadMJCF", "loadSDF"}
-BODY, LINK, DISTANCE = (1, 2), (3, 4), 8  # fields of a contact point of PyBullet
+BODY, LINK = (1, 2), (3, 4)  # fields of a contact point of PyBullet
 LOOKUPS = {"id", "name2id", "index", "find", "link", "joint", "geom", "body", "site", "sensor", "actuator"}
 FEWEST = 10
 DEEPEST = 6  # assignments that are followed
@@ -22,7 +24,7 @@ class Ids:
     """Of which kind the ids are that expressions hold: those of geoms, bodies, joints, sites, actuators, or links."""
 
     def __init__(self, definitions: Definitions) -> None:
-        self._definitions = definitions
+        self._definitions, self._fields = definitions, BulletFields(definitions)
 
     def find(self, node: ast.expr, depth: int = 0) -> set[str]:
         """Return the kinds of an expression, or of what it holds; empty for what is not known."""
@@ -48,7 +50,7 @@ class Ids:
                 return {kind for part in parts for kind in self.find(part, depth + 1)}
             case ast.ListComp(elt=part) | ast.SetComp(elt=part) | ast.GeneratorExp(elt=part):
                 return self.find(part, depth + 1)
-            case ast.Call(func=function, args=[part, *_]) if ast.unparse(function).rsplit(".", 1)[-1] in (
+            case ast.Call(func=function, args=[part, *_]) if read_name(function) in (
                 *("set", "list", "tuple", "sorted", "frozenset", "int", *CONVERSIONS),
             ):
                 return self.find(part, depth + 1)
@@ -63,20 +65,8 @@ class Ids:
         return set[str]().union(*found) if found and all(found) else set()
 
     def is_point(self, node: ast.expr) -> bool:
-        """Say whether a name goes through the contact points of PyBullet."""
-        values = self._definitions.read(node) if isinstance(node, ast.Name) else ()
-        return bool(values) and all(self._lists_points(value) for value in values)
-
-    def _lists_points(self, node: ast.expr, depth: int = 0) -> bool:
-        match node:
-            case ast.Call(func=ast.Attribute(attr="getContactPoints")):
-                return True
-            case ast.BoolOp(values=[first, *_]):
-                return self._lists_points(first, depth)
-            case ast.Name() | ast.Attribute() if depth < DEEPEST:
-                values = self._definitions.read(node)
-                return bool(values) and all(self._lists_points(value, depth + 1) for value in values)
-        return False
+        """Say whether an expression is a contact point of PyBullet."""
+        return self._fields.find_row(node) == "getContactPoints"
 
     def is_contact(self, node: ast.expr) -> bool:
         """Say whether an expression is called a contact, or several."""

@@ -10,12 +10,15 @@ from rlctl.checking.assignments import (
     LIBRARIES,
     Assignment,
     list_assignments,
+    list_parameters,
+    list_returned,
     read_converted,
     read_key,
     read_name,
     read_root,
 )
-from rlctl.checking.expressions import Function, NotedCall, SourceCode, walk_own
+from rlctl.checking.expressions import NotedCall
+from rlctl.checking.source_code import Function, SourceCode, walk_own
 
 DEEPEST = 12  # names and calls that are followed
 MOST_DEEP = 4  # the same, to all that a value may be computed from
@@ -131,7 +134,15 @@ class Definitions:
         if function is None:
             return []
         arguments = {key: place.at(value) for key, value in _bind(call, function).items()}
-        return _list_returned(function, arguments, place.depth)
+        return self.list_results(function, arguments, place.depth)
+
+    def list_results(
+        self, function: Function | None, arguments: Mapping[str, ReadExpression] | None = None, depth: int = 0
+    ) -> list[ReadExpression]:
+        """Return what a function returns, where it is called with these arguments; nothing where there is none."""
+        if function is None:
+            return []
+        return [ReadExpression(value, function, arguments or {}, depth) for value in list_returned(function)]
 
     def _list_given(self, place: ReadExpression, name: str) -> list[ReadExpression]:
         """Return what a parameter is in the calls of its function, where it is not known by which it was reached."""
@@ -146,7 +157,7 @@ class Definitions:
         if isinstance(place.node, ast.Attribute):
             function = self.find_function(place.node.attr)
             if function is not None and any("property" in ast.unparse(one) for one in function.decorator_list):
-                return _list_returned(function, {}, place.depth)
+                return self.list_results(function, {}, place.depth)
         found: list[ReadExpression] = []
         for function in self.called:
             if function is not place.function:
@@ -278,16 +289,8 @@ class Definitions:
 
 def _bind(call: ast.Call, function: Function) -> dict[str, ast.expr]:
     """Return what a call gives to the parameters of a function."""
-    names = [one.arg for one in [*function.args.posonlyargs, *function.args.args]]
-    if names[:1] in (["self"], ["cls"]):
-        names = names[1:]
-    given = dict(zip(names, call.args, strict=False))
+    given = dict(zip(list_parameters(function), call.args, strict=False))
     return given | {word.arg: word.value for word in call.keywords if word.arg}
-
-
-def _list_returned(function: Function, arguments: Mapping[str, ReadExpression], depth: int) -> list[ReadExpression]:
-    returned = [one.value for one in ast.walk(function) if isinstance(one, ast.Return) and one.value is not None]
-    return [ReadExpression(value, function, arguments, depth) for value in returned]
 
 
 def _list_parts(node: ast.AST) -> Iterator[ast.expr]:

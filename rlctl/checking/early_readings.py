@@ -14,8 +14,9 @@ import numpy as np
 from rlctl.checking.assignments import Assignment, read_key, read_name, read_words
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.expressions import Expression, Function, NotedCall
+from rlctl.checking.expressions import NotedCall
 from rlctl.checking.previous_values import PREVIOUS_WORDS, KeptDifference, KeptDifferences, is_goal
+from rlctl.checking.source_code import Expression, Function
 from rlctl.checking.term_names import split_name
 
 NOMINAL_WORDS = {
@@ -73,11 +74,9 @@ class _Candidate:
 class EarlyReadings:
     """Those of a source."""
 
-    def __init__(self, differences: KeptDifferences) -> None:
-        self.noted, self._differences = differences.noted, differences.differences
-        self.definitions = differences.definitions
-        of_resets = [call for episode in self.noted.episodes for call in episode[:1]]
-        self._run = {self.noted.source.expressions[number].function for call in of_resets for number in call.values}
+    def __init__(self, noted: NotedEpisodes) -> None:
+        self.noted, self.definitions = noted, noted.definitions
+        self._differences = noted.share(KeptDifferences).differences
 
     def find(self) -> Iterator[EarlyReading]:
         """Yield the values that were another one at the end of each reset, and that the first step subtracts."""
@@ -105,7 +104,7 @@ class EarlyReadings:
                 value = self.noted.source.find(one.value)
                 is_plain = one.element is None and not one.is_part and isinstance(one.statement, ast.Assign)
                 is_plain &= isinstance(one.target, ast.Attribute | ast.Subscript)
-                if key not in subtracted or value is None or not is_plain or one.function not in self._run:
+                if key not in subtracted or value is None or not is_plain or one.function not in self.noted.of_resets:
                     continue
                 opened = _OpenedNames(self.definitions, one)
                 again = opened.visit(copy.deepcopy(one.value))

@@ -1,4 +1,4 @@
-"""The expressions of an environment's own source, and what they were worth in each call of `reset` and `step`.
+"""What the expressions of an environment's own source were worth in each call of `reset` and `step`.
 
 The code of its functions is replaced by copies that note each expression; nothing is imported or built again.
 """
@@ -11,106 +11,20 @@ import copy
 import dataclasses
 import functools
 import inspect
-import sys
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.values import MOST_NUMBERS, NUMBERS, find_author, list_own_classes
-from rlctl.environments.places import is_own_file
+from rlctl.checking.source_code import SourceCode
+from rlctl.checking.values import MOST_NUMBERS, NUMBERS
 
 NOTE = "__rlctl_note__"  # the name of the function that is called with each value
-MOST_MODULES, MOST_EVENTS = 20, 1_500_000
+MOST_EVENTS = 1_500_000
 Number = float | NDArray[np.float64]
 Value = Number | None  # None for what is no number and no small array of numbers
-Function = ast.FunctionDef
-_WITH_CONTEXT = ast.Name | ast.Attribute | ast.Subscript | ast.List | ast.Tuple
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Expression:
-    """An expression of the source that is noted."""
-
-    number: int  # its place among all
-    node: ast.expr
-    file: str
-    function: Function  # in which it stands
-
-    @functools.cached_property
-    def text(self) -> str:
-        """The expression as it is written, in one line."""
-        return " ".join(ast.unparse(self.node).split())
-
-    @property
-    def where(self) -> tuple[str, int]:
-        """File and line."""
-        return self.file, self.node.lineno
-
-
-class SourceCode:
-    """The modules of an environment's author: those of its classes, and of the same folder what they have imported."""
-
-    def __init__(self, env: Any) -> None:
-        self.author = find_author(env)
-        self.modules = _list_modules(env)
-        self.classes = [cls.__name__ for cls in list_own_classes(find_author(env))]
-        """The author's classes of the environment, the most derived first."""
-        self.trees: dict[str, ast.Module] = {}
-        for module in self.modules:
-            with contextlib.suppress(OSError, SyntaxError, ValueError):
-                self.trees[str(module.__file__)] = ast.parse(Path(str(module.__file__)).read_bytes())
-        self.expressions: list[Expression] = []
-        self.parents: dict[ast.AST, ast.AST] = {}
-        for file, tree in self.trees.items():
-            self.parents |= {child: node for node in ast.walk(tree) for child in ast.iter_child_nodes(node)}
-            for function in ast.walk(tree):
-                if isinstance(function, Function):
-                    self._number(file, function)
-        self._numbers = {one.node: one.number for one in self.expressions}
-
-    def _number(self, file: str, function: Function) -> None:
-        for node in walk_own(function):
-            if isinstance(node, ast.expr) and _is_noted(node):
-                node.noted = len(self.expressions)  # type: ignore[attr-defined]  # copies of the node keep it
-                self.expressions.append(Expression(len(self.expressions), node, file, function))
-
-    def find(self, node: ast.AST) -> Expression | None:
-        """Return the noted expression of a node; None for one that is not noted, such as a constant."""
-        number = self._numbers.get(node)  # type: ignore[call-overload]
-        return None if number is None else self.expressions[number]
-
-    @functools.cached_property
-    def functions(self) -> Mapping[str, Sequence[Function]]:
-        """All functions and methods by name."""
-        found = collections.defaultdict[str, list[Function]](list)
-        for tree in self.trees.values():
-            for node in ast.walk(tree):
-                if isinstance(node, Function):
-                    found[node.name].append(node)
-        return found
-
-    def find_statement(self, node: ast.AST) -> ast.stmt:
-        """Return the innermost statement that has a node."""
-        while not isinstance(node, ast.stmt):
-            node = self.parents[node]
-        return node
-
-    def find_place(self, node: ast.stmt) -> tuple[str, int]:
-        """Return file and line of a statement."""
-        top: ast.AST = node
-        while top in self.parents:
-            top = self.parents[top]
-        return next(file for file, tree in self.trees.items() if tree is top), node.lineno
-
-    def find_function(self, node: ast.AST) -> Function:
-        """Return the innermost function around a node."""
-        while not isinstance(node, Function):
-            node = self.parents[node]
-        return node
 
 
 @dataclasses.dataclass(eq=False)
@@ -195,17 +109,6 @@ def record_expressions(source: SourceCode) -> Iterator[ExpressionRecorder]:
         delattr(builtins, NOTE)
 
 
-def _list_modules(env: Any) -> list[ModuleType]:
-    own = [sys.modules.get(cls.__module__) for cls in list_own_classes(find_author(env))]
-    modules = {id(module): module for module in own if module is not None and getattr(module, "__file__", None)}
-    folders = {Path(str(module.__file__)).parent for module in modules.values()}
-    for module in list(sys.modules.values()):
-        file = getattr(module, "__file__", None)
-        if isinstance(file, str) and Path(file).parent in folders and is_own_file(file):
-            modules.setdefault(id(module), module)
-    return list(modules.values())[:MOST_MODULES]
-
-
 def _list_functions(module: ModuleType) -> Iterator[FunctionType]:
     """Yield the functions of a module and of its classes."""
     for member in list(vars(module).values()):
@@ -236,22 +139,6 @@ def _list_codes(code: CodeType) -> Iterator[CodeType]:
         if isinstance(constant, CodeType):
             yield constant
             yield from _list_codes(constant)
-
-
-def walk_own(function: Function) -> Iterator[ast.AST]:
-    """Yield the nodes of a function's statements, without those of functions and classes in it."""
-    waiting: list[ast.AST] = [*reversed(function.body)]
-    while waiting:
-        node = waiting.pop()
-        yield node
-        if not isinstance(node, Function | ast.AsyncFunctionDef | ast.ClassDef):
-            waiting += reversed(list(ast.iter_child_nodes(node)))
-
-
-def _is_noted(node: ast.expr) -> bool:
-    if isinstance(node, _WITH_CONTEXT):
-        return isinstance(node.ctx, ast.Load)
-    return isinstance(node, ast.BinOp | ast.UnaryOp | ast.BoolOp | ast.Compare | ast.Call | ast.IfExp)
 
 
 class _Noting(ast.NodeTransformer):

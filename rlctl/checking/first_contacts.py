@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from rlctl.checking.assignments import read_key
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.expressions import Expression, NotedCall
+from rlctl.checking.expressions import NotedCall
+from rlctl.checking.source_code import Expression
 
 FEWEST_STAYS = 20  # steps in which a contact goes on
 EXACT = 1e-6

@@ -5,12 +5,12 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 
-from rlctl.checking.assignments import LIBRARIES, read_converted, read_name, read_root
+from rlctl.checking.assignments import LIBRARIES, list_words, read_converted, read_name, read_root
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.expressions import Expression, Function
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS
 from rlctl.checking.paid_goals import AVOIDED_WORDS
+from rlctl.checking.source_code import Expression, Function
 from rlctl.checking.summands import Summand
 from rlctl.checking.term_names import split_name
 
@@ -164,14 +164,7 @@ class DistanceReader:
         """Return the words of the names with which a side is written, and of those that it stands for."""
         words: set[str] = set()
         for _ in range(DEEPEST):
-            parts = [part for part in ast.walk(side.node) if isinstance(part, ast.Name | ast.Attribute | ast.Subscript)]
-            words |= {word for part in parts for word in split_name(read_name(part))}
-            words |= {
-                word
-                for part in ast.walk(side.node)
-                if isinstance(part, ast.Constant) and isinstance(part.value, str)
-                for word in split_name(part.value)
-            }
+            words |= list_words(side.node)
             found = self.definitions.follow(side)
             if len(found) != 1:
                 break

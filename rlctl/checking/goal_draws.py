@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.assignments import Assignment, peel
-from rlctl.checking.expressions import Expression, Function, NotedCall, Value
+from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.previous_values import KeptDifference, KeptDifferences, is_goal, is_previous_key
+from rlctl.checking.source_code import Expression, Function
 from rlctl.checking.timed_expressions import spans_steps
 
 FEW_STEPS = 5
@@ -47,8 +49,8 @@ class Branch:
 class GoalDraws:
     """The branches that go on to new goals."""
 
-    def __init__(self, kept: KeptDifferences) -> None:
-        self.kept, self.definitions, self.noted = kept, kept.definitions, kept.noted
+    def __init__(self, noted: NotedEpisodes) -> None:
+        self.noted, self.definitions, self.kept = noted, noted.definitions, noted.share(KeptDifferences)
 
     def find_jumps(self) -> Iterator[GoalJump]:
         """Yield differences that jump with a new goal, and are paid."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rlctl.checking.assignments import read_key
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.expressions import Expression
 from rlctl.checking.previous_values import is_goal
+from rlctl.checking.source_code import Expression
 
 FEWEST = 20  # steps
 SAME = 1e-6  # how much a distance may change while both places move

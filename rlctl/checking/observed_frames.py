@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.assignments import CONVERSIONS
+from rlctl.checking.assignments import CONVERSIONS, list_words, read_name
 from rlctl.checking.definitions import Definitions
-from rlctl.checking.expressions import Function
 from rlctl.checking.rule import Rule, RuleFinding
+from rlctl.checking.source_code import Function
 from rlctl.checking.turned_expressions import VectorTurn
-from rlctl.checking.vector_series import VectorSeries, list_words
+from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.world_vectors import WorldVectors
 from rlctl.checking.wrong_turns import FRAME_RULES, TurnedVectors
 
@@ -60,7 +60,7 @@ class ObservedCode:
 
     def is_base_velocity(self, node: ast.expr | None) -> bool:
         """Say whether a name has what PyBullet returns as a velocity of a base, in the world's frame."""
-        while isinstance(node, ast.Call) and ast.unparse(node.func).rsplit(".", 1)[-1] in PASSED_ON and node.args:
+        while isinstance(node, ast.Call) and read_name(node.func) in PASSED_ON and node.args:
             node = node.args[0]
         values = self._definitions.read_parts(node) if isinstance(node, ast.Name) else ()
         return any("getBaseVelocity(" in ast.unparse(value) for value in values)
@@ -95,7 +95,7 @@ class ObservedCode:
             case ast.Name():
                 return [*self._definitions.read(node), *self._definitions.read_parts(node), *self._list_appended(node)]
             case ast.Call(func=function, args=args, keywords=keywords):
-                name = ast.unparse(function).rsplit(".", 1)[-1]
+                name = read_name(function)
                 owner = [function.value] if isinstance(function, ast.Attribute) else []
                 given = [*args, *(keyword.value for keyword in keywords)]
                 if name in PASSED_ON:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rlctl.checking.assignments import read_name
+from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import COMMAND_WORDS, WANTED_WORDS, ErrorReader, has_both_signs
@@ -38,7 +38,7 @@ class CommandReader:
 
     def __init__(self, notes: NotedEpisodes) -> None:
         self.notes = notes
-        self.errors = ErrorReader(notes)
+        self.errors = notes.share(ErrorReader)
         self.definitions = notes.reward.definitions
         self.walked = [(one, list(self.definitions.walk(one.place))) for one in notes.reward.summands]
         self.walked += [(one, list(self.definitions.walk(one.place))) for one in notes.reward.differences]
@@ -249,5 +249,4 @@ def read_last_index(node: ast.AST) -> int | None:
 
 
 def _is_command(node: ast.expr, words: set[str] = WANTED_WORDS) -> bool:
-    names = {word for part in ast.walk(node) if isinstance(part, ast.expr) for word in split_name(read_name(part))}
-    return bool(names & words)
+    return bool(list_name_words(node) & words)

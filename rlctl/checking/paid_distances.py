@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.checking.definitions import ReadExpression
+from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.forced_rewards import ForcedRewards
 from rlctl.checking.goal_distances import DistanceReader, GoalDistance
@@ -34,13 +35,13 @@ class RisingReward:
 class RiseReader:
     """Finds rewards that rise with a distance, in steps in which nothing else changes."""
 
-    def __init__(self, goals: GoalReader) -> None:
-        self.notes, self.goals = goals.notes, goals
-        self.forced = ForcedRewards(goals.notes)
+    def __init__(self, notes: NotedEpisodes) -> None:
+        self.notes, self.goals = notes, notes.share(GoalReader)
+        self.forced = ForcedRewards(notes)
 
     def find_rises(self) -> Iterator[RisingReward]:
         """Yield them."""
-        for one in DistanceReader(self.notes).distances:
+        for one in self.notes.share(DistanceReader).distances:
             if self._rises_first(one) and self._rises_everywhere(one):
                 found = self._describe(one)
                 if found is not None:

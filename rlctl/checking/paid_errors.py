@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.assignments import read_name
+from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.products import list_product
@@ -206,9 +206,8 @@ class ErrorReader:
 
     def is_between_steps(self, place: ReadExpression) -> bool:
         """Say whether a difference is that to a value of the step before, by names or by values."""
-        words = {word for node in ast.walk(place.node) for word in split_name(read_name(node))}  # type: ignore[arg-type]
         one = self.notes.source.find(place.node)
-        return bool(words & EARLIER_WORDS) or (
+        return bool(list_name_words(place.node) & EARLIER_WORDS) or (
             one is not None and spans_steps(self.notes.source, one, self.notes.steps)
         )
 

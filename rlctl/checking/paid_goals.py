@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 
-from rlctl.checking.assignments import read_name
+from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed
@@ -54,7 +54,7 @@ class GoalReader:
 
     def __init__(self, notes: NotedEpisodes) -> None:
         self.notes, self.reward = notes, notes.reward
-        self.errors = ErrorReader(notes)
+        self.errors = notes.share(ErrorReader)
         self.definitions = notes.reward.definitions
 
     def find_wrong_signs(self) -> Iterator[PaidDistance]:
@@ -123,8 +123,7 @@ class GoalReader:
         return any(set(split_name(one.name)) & EARLIER_WORDS or self._is_earlier(one.place) for one in others)
 
     def _is_earlier(self, place: ReadExpression) -> bool:
-        words = {word for node in ast.walk(place.node) for word in split_name(read_name(node))}  # type: ignore[arg-type]
-        return bool(words & EARLIER_WORDS)
+        return bool(list_name_words(place.node) & EARLIER_WORDS)
 
     def _pays_leaving(self, summand: Summand) -> bool:
         """Say whether it is what a distance is now, less what it was before, and is paid."""
@@ -155,7 +154,6 @@ class GoalReader:
 
     def read_success(self) -> ReadExpression | None:
         """Return the expression that tells success."""
-        method = self.definitions.find_function("is_success")
         step = self.definitions.find_function("step")
         for node in ast.walk(step) if step is not None else ():
             assert step is not None
@@ -167,10 +165,8 @@ class GoalReader:
                 case ast.Assign(targets=[ast.Subscript(slice=ast.Constant(value=key))], value=value):
                     if key in SUCCESS_KEYS:
                         return self._resolve_flag(ReadExpression(value, step, {}))
-        for node in ast.walk(method) if method is not None else ():
-            if isinstance(node, ast.Return) and node.value is not None and method is not None:
-                return self._resolve_flag(ReadExpression(node.value, method, {}))
-        return None
+        returned = self.definitions.list_results(self.definitions.find_function("is_success"))
+        return self._resolve_flag(returned[0]) if returned else None
 
     def _resolve_flag(self, place: ReadExpression) -> ReadExpression:
         while True:
@@ -204,16 +200,11 @@ class GoalReader:
         if success is None or step is None:
             return False
         flags = [
-            ReadExpression(node.value.elts[2], step, {})
-            for node in ast.walk(step)
-            if isinstance(node, ast.Return) and isinstance(node.value, ast.Tuple) and len(node.value.elts) == 5
+            returned.at(returned.node.elts[2])
+            for returned in self.definitions.list_results(step)
+            if isinstance(returned.node, ast.Tuple) and len(returned.node.elts) == 5
         ]
-        method = self.definitions.find_function("is_terminated")
-        flags += [
-            ReadExpression(node.value, method, {})
-            for node in ast.walk(method or step)
-            if method is not None and isinstance(node, ast.Return) and node.value is not None
-        ]
+        flags += self.definitions.list_results(self.definitions.find_function("is_terminated"))
         return any(self._has_success(flag, success) for flag in flags)
 
     def _has_success(self, flag: ReadExpression, success: ReadExpression) -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.checking.definitions import ReadExpression
+from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.forced_rewards import ForcedRewards
 from rlctl.checking.goal_distances import DistanceReader
 from rlctl.checking.paid_goals import GoalReader
@@ -34,10 +35,10 @@ class LowSuccess:
 class SuccessReader:
     """Compares them."""
 
-    def __init__(self, goals: GoalReader) -> None:
-        self.notes, self.goals, self.definitions = goals.notes, goals, goals.definitions
-        self.forced = ForcedRewards(goals.notes)
-        self.distances = {one.expression.number: one.largest for one in DistanceReader(goals.notes).distances}
+    def __init__(self, notes: NotedEpisodes) -> None:
+        self.notes, self.goals, self.definitions = notes, notes.share(GoalReader), notes.definitions
+        self.forced = ForcedRewards(notes)
+        self.distances = {one.expression.number: one.largest for one in notes.share(DistanceReader).distances}
 
     def find(self) -> LowSuccess | None:
         """Return a success that pays less in each episode that is looked at."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from rlctl.checking.assignments import Assignment, read_key, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.expressions import Expression, NotedCall, Value
+from rlctl.checking.expressions import NotedCall, Value
+from rlctl.checking.source_code import Expression
 from rlctl.checking.term_names import ERROR_WORDS, is_place, split_name
 
 PREVIOUS_WORDS = {"before", "former", "last", "old", "prev", "previous", "prior", "past"}

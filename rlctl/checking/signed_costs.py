@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rlctl.checking.assignments import read_name
+from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import CLEAR, EARLIER_WORDS, FEWEST, ErrorReader, has_both_signs
@@ -34,7 +34,7 @@ class SignedCostReader:
 
     def __init__(self, notes: NotedEpisodes) -> None:
         self.notes, self.reward = notes, notes.reward
-        self.errors = ErrorReader(notes)
+        self.errors = notes.share(ErrorReader)
         self.definitions = self.reward.definitions
 
     def find(self) -> Iterator[tuple[Summand, ReadExpression]]:
@@ -75,13 +75,7 @@ class SignedCostReader:
     def _should_be_small(self, summand: Summand, hops: list[ReadExpression]) -> bool:
         """Say whether it is named so, or whether the source takes its size elsewhere."""
         words = {word for name in (summand.name, *summand.names) for word in split_name(name)} - REWARD_NAMES
-        for hop in hops:
-            words |= {
-                word
-                for part in ast.walk(hop.node)
-                if isinstance(part, ast.Name | ast.Attribute | ast.Subscript)
-                for word in split_name(read_name(part))
-            }
+        words = words.union(*(list_name_words(hop.node) for hop in hops))
         if words & (MEANT_WORDS | EARLIER_WORDS):
             return False
         arguments = [

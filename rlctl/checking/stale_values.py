@@ -2,16 +2,17 @@
 
 import ast
 import dataclasses
-import functools
 import itertools
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from rlctl.checking.assignments import Assignment, read_key, read_words
-from rlctl.checking.expressions import Expression, NotedCall, Value
+from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.goal_draws import BEFORE, Branch, GoalDraws
-from rlctl.checking.previous_values import is_previous_key
+from rlctl.checking.previous_values import KeptDifferences, is_previous_key
+from rlctl.checking.source_code import Expression
 
 FIRST_WORDS = {
     "start", "started", "initial", "init", "first", "default", "nominal", "home", "original", "base", "begin", "origin",
@@ -39,8 +40,9 @@ class StaleCopy:
 class StaleValues:
     """What no step sets, though it should."""
 
-    def __init__(self, draws: GoalDraws) -> None:
-        self.draws, self.definitions, self.noted, self.kept = draws, draws.definitions, draws.noted, draws.kept
+    def __init__(self, noted: NotedEpisodes) -> None:
+        self.noted, self.definitions = noted, noted.definitions
+        self.draws, self.kept = noted.share(GoalDraws), noted.share(KeptDifferences)
 
     def find_stale_copies(self) -> Iterator[StaleCopy]:
         """Yield copies that no step makes, of goals that steps change: afterwards both are read."""
@@ -87,9 +89,9 @@ class StaleValues:
         return {one: not _is_same(old[0], new[0]) for one, (old, new) in values.items() if old and new}
 
     def find_first_only(self) -> Iterator[StaleCopy]:
-        """Yield attributes that only the first reset sets, from others that each reset sets anew."""
+        """Yield attributes that only the first reset sets, from others that each reset sets."""
         for key, assignments in self.definitions.assigned.items():
-            of_episodes = [one for one in assignments if one.function in self._of_resets]
+            of_episodes = [one for one in assignments if one.function in self.noted.of_resets]
             if len(of_episodes) != 1 or not self._is_once(of_episodes[0], key):
                 continue
             (one,) = of_episodes
@@ -99,15 +101,12 @@ class StaleValues:
                     yield StaleCopy(key, name, read)
                     return
 
-    @functools.cached_property
-    def _of_resets(self) -> Collection[ast.AST]:
-        calls = [episode[0] for episode in self.noted.episodes]
-        return {self.noted.source.expressions[number].function for call in calls for number in call.values}
-
     def _is_once(self, assignment: Assignment, key: str) -> bool:
         """Say whether an assignment, or a call of its function, stands under `if self.goal is None`, or the like, and
         no step runs it."""
-        calls = [call for call, caller in self.definitions.calls[assignment.function.name] if caller in self._of_resets]
+        calls = [
+            call for call, caller in self.definitions.calls[assignment.function.name] if caller in self.noted.of_resets
+        ]
         places = [assignment.statement, *calls[: len(calls) == 1]]
         for test, is_met in [pair for place in places for pair in self.definitions.list_conditions(place)]:
             match test:
@@ -171,7 +170,8 @@ class StaleValues:
             case ast.AugAssign(op=ast.Add(), value=value):
                 added = value
             case ast.Assign(value=ast.BinOp(left=left, op=ast.Add(), right=right)):
-                added = right if read_key(left) == key else left if read_key(right) == key else None
+                others = [other for side, other in ((left, right), (right, left)) if read_key(side) == key]
+                added = others[0] if others else None
         if added is None:
             return False
         conditions = self.definitions.list_conditions(assignment.statement)

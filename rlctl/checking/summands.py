@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from rlctl.checking.assignments import Assignment, read_name
 from rlctl.checking.definitions import DEEPEST, Definitions, ReadExpression
-from rlctl.checking.expressions import Function, NotedCall
+from rlctl.checking.expressions import NotedCall
 from rlctl.checking.noted_numbers import NotedNumbers
 from rlctl.checking.products import find_function_of_values, list_product
+from rlctl.checking.source_code import write_code
 from rlctl.checking.term_names import split_name
 
 REWARD_METHODS = ("rewards", "reward")  # of a task, which returns terms by name
@@ -34,7 +35,7 @@ class Summand:
     @property
     def text(self) -> str:
         """The expression as it is written, in one line."""
-        return " ".join(ast.unparse(self.place.node).split())
+        return write_code(self.place.node)
 
 
 class RewardReader:
@@ -44,8 +45,6 @@ class RewardReader:
         self.definitions, self.source = definitions, definitions.source
         self.numbers = NotedNumbers(definitions, calls)
         self.weights = weights  # of a task's terms
-        functions = [(node, file) for file, tree in self.source.trees.items() for node in ast.walk(tree)]
-        self._files = {node: file for node, file in functions if isinstance(node, Function)}
         self._differences: list[Summand] = []
         self._path: list[str] = []  # names through which summands are being reached
 
@@ -70,14 +69,13 @@ class RewardReader:
 
     def locate(self, place: ReadExpression) -> tuple[str, int]:
         """Return file and line of an expression."""
-        return self._files[place.function], place.node.lineno
+        return self.source.find_place(place.node)
 
     def _list_rewards(self) -> Iterator[ReadExpression]:
-        step = self.definitions.find_function("step")
-        for node in ast.walk(step) if step is not None and not self.weights else ():
-            if isinstance(node, ast.Return) and node.value is not None and step is not None:
-                for whole in self._list_tuples(ReadExpression(node.value, step, {})):
-                    yield whole.at(whole.node.elts[1])  # type: ignore[attr-defined]
+        step = self.definitions.find_function("step") if not self.weights else None
+        for returned in self.definitions.list_results(step):
+            for whole in self._list_tuples(returned):
+                yield whole.at(whole.node.elts[1])  # type: ignore[attr-defined]
 
     def _list_tuples(self, place: ReadExpression) -> Iterator[ReadExpression]:
         if isinstance(place.node, ast.Tuple):
@@ -89,10 +87,8 @@ class RewardReader:
 
     def _list_terms(self) -> Iterator[tuple[str, ReadExpression, tuple[Condition, ...]]]:
         for name in REWARD_METHODS if self.weights else ():
-            method = self.definitions.find_function(name)
-            for node in ast.walk(method) if method is not None else ():
-                if isinstance(node, ast.Return) and node.value is not None and method is not None:
-                    yield from self._list_entries(ReadExpression(node.value, method, {}))
+            for returned in self.definitions.list_results(self.definitions.find_function(name)):
+                yield from self._list_entries(returned)
 
     def _expand(
         self, place: ReadExpression, weight: float, name: str, conditions: tuple[Condition, ...], replaces: bool = False

@@ -13,9 +13,10 @@ import numpy as np
 
 from rlctl.checking.assignments import list_values
 from rlctl.checking.experiments.attributes import AttributeLog
-from rlctl.checking.expressions import Expression, NotedCall, SourceCode, Value
+from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable
+from rlctl.checking.source_code import Expression, SourceCode
 from rlctl.checking.step_times import SUBSTEP_WORDS, StepTimes, require_step_times
 from rlctl.checking.term_names import split_name
 

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rlctl.checking.assignments import list_parameters, list_words
 from rlctl.checking.attitudes import compute_matrices
-from rlctl.checking.expressions import Expression, NotedCall, Value
+from rlctl.checking.expressions import NotedCall, Value
+from rlctl.checking.source_code import Expression
 from rlctl.checking.turned_expressions import VectorTurn
-from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries, list_words
+from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries
 
 INVERSE_WORDS = {"inv", "inverse", "invert", "conj", "conjugate", "transpose"}
 ANGLE_WORDS = {"yaw", "heading", "theta", "psi", "course", "euler", "rpy", "joint", "joints", "angle", "qpos", "turn"}
@@ -128,7 +130,7 @@ def _choose(found: Sequence[tuple[int, int, str]]) -> tuple[int, str] | None:
 
 def _rank(one: Expression) -> int:
     """Return 0 for what is stored, 1 for what is read, and 2 for what may be the inverse of an orientation."""
-    parameters = {argument.arg for argument in one.function.args.args} - {"self"}
+    parameters = set(list_parameters(one.function))
     names = {node.id for node in ast.walk(one.node) if isinstance(node, ast.Name)}
     if names & parameters or list_words(one.node) & INVERSE_WORDS or isinstance(one.node, ast.BinOp | ast.UnaryOp):
         return 2

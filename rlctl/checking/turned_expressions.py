@@ -8,7 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rlctl.checking.expressions import Expression
+from rlctl.checking.assignments import list_parameters
+from rlctl.checking.source_code import Expression, Function
 from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries
 
 LEAST_TURN = 0.002  # of a vector's length, that a turn moves it
@@ -70,7 +71,7 @@ class _Sum:
 
 def _find_written_out(series: VectorSeries) -> Iterator[VectorTurn]:
     """Yield turns in the plane that are written by elements: c * x - s * y and s * x + c * y."""
-    sums: dict[ast.AST, list[_Sum]] = collections.defaultdict(list)
+    sums = collections.defaultdict[Function, list[_Sum]](list)
     for one in series.source.expressions:
         match one.node:
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
@@ -78,7 +79,7 @@ def _find_written_out(series: VectorSeries) -> Iterator[VectorTurn]:
                 if products[0] is not None and products[1] is not None:
                     sums[one.function].append(_Sum(one, (products[0], products[1])))
     for function, found in sums.items():
-        parameters = {argument.arg for argument in function.args.args} - {"self"}  # type: ignore[attr-defined]
+        parameters = set(list_parameters(function))
         for first, second in itertools.pairwise(found):
             turn = _read_pair(series, first, second, parameters)
             if turn is not None and _is_turn(turn.before, turn.after):

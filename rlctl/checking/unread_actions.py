@@ -5,9 +5,9 @@ import collections
 import dataclasses
 from collections.abc import Collection, Iterator
 
-from rlctl.checking.assignments import CONVERSIONS
-from rlctl.checking.expressions import Function, SourceCode
+from rlctl.checking.assignments import CONVERSIONS, list_parameters, list_words, read_name
 from rlctl.checking.rule import Rule, RuleFinding
+from rlctl.checking.source_code import Function, SourceCode
 from rlctl.checking.term_names import split_name
 
 ACTORS = {"step", "act", "apply_action", "step_async", "_apply_action", "apply_actions", "_act"}
@@ -55,8 +55,7 @@ def _list_vectors(function: Function) -> list[str]:
     """Return the names of the action, and of what it is multiplied to, element by element."""
     if function.name not in ACTORS:
         return []
-    arguments = [argument.arg for argument in function.args.args if argument.arg != "self"]
-    names = arguments[:1]
+    names = list_parameters(function)[:1]
     for node in ast.walk(function):
         if isinstance(node, ast.Assign) and len(node.targets) == 1 and isinstance(node.targets[0], ast.Name):
             target = node.targets[0].id
@@ -73,7 +72,7 @@ def _is_same_shape(node: ast.expr, names: list[str]) -> bool:
         case ast.BinOp(left=left, op=ast.Mult() | ast.Add() | ast.Sub() | ast.Div(), right=right):
             one = _is_same_shape(left, names) and not _holds(right, names)
             return one or (_is_same_shape(right, names) and not _holds(left, names))
-        case ast.Call(func=function, args=[first, *_]) if ast.unparse(function).rsplit(".", 1)[-1] in SAME_SHAPE:
+        case ast.Call(func=function, args=[first, *_]) if read_name(function) in SAME_SHAPE:
             return _is_same_shape(first, names)
         case ast.Call(func=ast.Attribute(value=owner, attr=name)) if name in SAME_SHAPE:
             return _is_same_shape(owner, names)
@@ -131,18 +130,15 @@ def _is_harmless(source: SourceCode, node: ast.expr, names: list[str]) -> bool:
     while True:
         above = source.parents[node]
         match above:
-            case ast.Call(func=function) if ast.unparse(function).rsplit(".", 1)[-1] in COSTS:
+            case ast.Call(func=function) if read_name(function) in COSTS:
                 return True
-            case ast.Call(func=function) if (
-                node is not function and ast.unparse(function).rsplit(".", 1)[-1] not in SAME_SHAPE
-            ):
+            case ast.Call(func=function) if node is not function and read_name(function) not in SAME_SHAPE:
                 return False
             case ast.BinOp(op=ast.Pow()):
                 return True
             case ast.BinOp(left=left, right=right):
                 other = right if left is node else left
-                words = {word for part in ast.walk(other) for word in split_name(_name(part))}
-                if words & OLD_WORDS:
+                if list_words(other) & OLD_WORDS:
                     return True
             case ast.Attribute(attr="shape" | "size" | "dtype"):
                 return True
@@ -156,15 +152,6 @@ def _is_harmless(source: SourceCode, node: ast.expr, names: list[str]) -> bool:
             case ast.stmt():
                 return False
         node = above  # type: ignore[assignment]
-
-
-def _name(node: ast.AST) -> str:
-    match node:
-        case ast.Name(id=name) | ast.Attribute(attr=name):
-            return name
-        case ast.Constant(value=str(name)):
-            return name
-    return ""
 
 
 def _count_statements(source: SourceCode, nodes: list[ast.Subscript]) -> int:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.expressions import Expression, NotedCall, SourceCode
-from rlctl.checking.term_names import split_name
+from rlctl.checking.assignments import list_words
+from rlctl.checking.expressions import NotedCall
+from rlctl.checking.source_code import Expression, SourceCode
 
 Array = NDArray[np.float64]
 
@@ -76,11 +77,3 @@ class VectorSeries:
     def _is_matrix(self, one: Expression) -> bool:
         values = [last[one.number] for last in self._last if one.number in last]
         return len(values) >= FEWEST and all(np.size(value) == 9 for value in values if value is not None)
-
-
-def list_words(node: ast.AST) -> set[str]:
-    """Return the words of all names in a piece of code."""
-    names = [one.id for one in ast.walk(node) if isinstance(one, ast.Name)]
-    names += [one.attr for one in ast.walk(node) if isinstance(one, ast.Attribute)]
-    names += [one.value for one in ast.walk(node) if isinstance(one, ast.Constant) and isinstance(one.value, str)]
-    return {word for name in names for word in split_name(name)}

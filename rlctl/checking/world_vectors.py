@@ -9,10 +9,11 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.expressions import Expression
+from rlctl.checking.assignments import list_parameters, list_words
+from rlctl.checking.source_code import Expression
 from rlctl.checking.term_names import split_name
 from rlctl.checking.turned_expressions import VectorTurn
-from rlctl.checking.vector_series import FEWEST, MOSTLY, NEARLY_ALL, SAME, Array, VectorSeries, list_words
+from rlctl.checking.vector_series import FEWEST, MOSTLY, NEARLY_ALL, SAME, Array, VectorSeries
 
 PLACE_WORDS = {
     *("pos", "position", "positions", "place", "xpos", "goal", "goals", "target", "targets", "waypoint", "waypoints"),
@@ -181,7 +182,7 @@ class WorldVectors:
 def _is_place(one: Expression) -> bool:
     """Say whether an expression is called a place, and not the angles of joints."""
     words = list_words(one.node)
-    parameters = {argument.arg for argument in one.function.args.args} - {"self"}
+    parameters = set(list_parameters(one.function))
     if any(isinstance(node, ast.Name) and node.id in parameters for node in ast.walk(one.node)):
         return False  # of a function that may be called with anything
     if not isinstance(one.node, ast.Name | ast.Attribute | ast.Subscript) or words & JOINT_WORDS:

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator
 
+from rlctl.checking.assignments import list_words
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turn_directions import Directions
 from rlctl.checking.turned_expressions import find_turns
-from rlctl.checking.vector_series import VectorSeries, list_words
+from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.world_vectors import WorldVectors
 
 WORLD_WORDS = {"world", "global", "inertial", "map"}

@@ -1,5 +1,6 @@
 """Judges an environment in this process, and the cases that every rule has: one that breaks it, one that does not."""
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -14,6 +15,9 @@ import pytest
 
 from rlctl.checking import children
 from rlctl.checking.check import judge
+from rlctl.checking.experiments.expressions import BY_EXPRESSIONS, noted_episodes
+from rlctl.checking.instance import Budget, Context
+from rlctl.checking.progress import read_clock
 from rlctl.checking.records import Records
 from rlctl.checking.rules import PROCESS_S, PROCESSES, RULES, find_needs
 from rlctl.environments.bullet_clients import find_clients
@@ -151,6 +155,20 @@ def found(task, *rules):
 def rules_of(family):
     """The rules of a family."""
     return [rule for rule in RULES if rule.startswith(family)]
+
+
+@contextlib.contextmanager
+def notes_of(task):
+    """What the expressions of a task's source are worth in short episodes, which can be played again meanwhile."""
+    context = Context(EnvSpec(_path(task)))
+    context.budget = Budget(read_clock() + SECONDS)
+    with noted_episodes(context) as notes:
+        yield notes
+
+
+def found_in_source(task):
+    """The findings by the expressions of the source alone, by rule."""
+    return {one.rule: one for one in records_of(task, "build", "expressions").facts[BY_EXPRESSIONS]}
 
 
 def check_case(case):

@@ -4,15 +4,11 @@ cannot meet it, or always does."""
 import pytest
 
 from rlctl.checking.command_sizes import SizeReader
-from rlctl.checking.experiments.expressions import noted_episodes
-from rlctl.checking.instance import Budget, Context
 from rlctl.checking.paid_distances import RiseReader
 from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.paid_successes import SuccessReader
-from rlctl.checking.progress import read_clock
 from rlctl.checking.signed_costs import SignedCostReader
-from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import FOLDER, case, check_case, mark_slow
+from tests.checking.judging import case, check_case, mark_slow, notes_of
 
 FILE = "broken_amounts.py"
 
@@ -36,19 +32,16 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 def judge(name, find):
-    context = Context(EnvSpec(f"{FOLDER / FILE}:{name}"))
-    context.budget = Budget(read_clock() + 60.0)
-    with noted_episodes(context) as notes:
+    with notes_of(f"{FILE}:{name}") as notes:
         return find(notes)
 
 
 def find_rises(notes):
-    reader = GoalReader(notes)
-    return [*reader.find_wrong_signs(), *RiseReader(reader).find_rises()]
+    return [*GoalReader(notes).find_wrong_signs(), *RiseReader(notes).find_rises()]
 
 
 def find_low_successes(notes):
-    low = SuccessReader(GoalReader(notes)).find()
+    low = SuccessReader(notes).find()
     return [] if low is None else [low]
 
 

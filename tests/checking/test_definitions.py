@@ -7,7 +7,8 @@ import pytest
 
 from rlctl.checking.assignments import list_assignments, list_values, peel, read_key, read_name
 from rlctl.checking.definitions import Definitions, ReadExpression
-from rlctl.checking.expressions import SourceCode, record_expressions
+from rlctl.checking.expressions import record_expressions
+from rlctl.checking.source_code import SourceCode
 
 
 class Slider(gymnasium.Env):

@@ -2,8 +2,7 @@
 
 import pytest
 
-from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
-from tests.checking.judging import case, check_case, findings, mark_slow, records_of
+from tests.checking.judging import case, check_case, findings, found_in_source, mark_slow
 
 pytest.importorskip("mujoco")
 
@@ -25,25 +24,19 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-def read_source(name):
-    """Return the rules that find something in the expressions of a class."""
-    records = records_of(f"{FILE}:{name}", "build", "expressions")
-    return {one.rule for one in records.facts[BY_EXPRESSIONS]}
-
-
 @pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize("name", PAIRS)
 def test_finds_what_is_read_too_early(name):
-    assert "RL642" in read_source(name)
-    assert not read_source(PAIRS[name])
+    assert "RL642" in found_in_source(f"{FILE}:{name}")
+    assert not found_in_source(f"{FILE}:{PAIRS[name]}")
 
 
 @pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize("name", ["RaftSettles", "RaftLevels", "PuckGlides"])
 def test_what_happens_in_between_and_what_is_read_of_the_last_episode(name):
-    assert "RL642" not in read_source(name)
+    assert "RL642" not in found_in_source(f"{FILE}:{name}")
 
 
 @pytest.mark.slow

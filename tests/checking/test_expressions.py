@@ -11,8 +11,9 @@ import pytest
 
 from rlctl.checking import children
 from rlctl.checking.experiment import PROBE
-from rlctl.checking.expressions import SourceCode, record_expressions
+from rlctl.checking.expressions import record_expressions
 from rlctl.checking.records import Finished, Skipped
+from rlctl.checking.source_code import SourceCode
 from rlctl.checking.step_times import StepTimes
 from rlctl.checking.timed_expressions import Use, find_majority, find_timed_expressions
 from rlctl.environments.spec import EnvSpec

@@ -2,9 +2,7 @@
 
 import pytest
 
-from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
-from rlctl.checking.rule import RuleFinding
-from tests.checking.judging import case, check_case, mark_slow, records_of
+from tests.checking.judging import case, check_case, found_in_source, mark_slow
 
 FILE = "broken_fields.py"
 FORCES = ["RamAny", "RamConstant", "RamSum", "RamLargest"]
@@ -19,21 +17,15 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-def read_source(name):
-    """Return the rules that find something in the expressions of a class."""
-    records = records_of(f"{FILE}:{name}", "build", "expressions")
-    return {one.rule for one in records.facts[BY_EXPRESSIONS] if isinstance(one, RuleFinding)}
-
-
 @pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize("name", WRONG)
 def test_another_field_is_read(name):
-    assert read_source(name) == {WRONG[name]}
+    assert found_in_source(f"{FILE}:{name}").keys() == {WRONG[name]}
 
 
 @pytest.mark.slow
 @pytest.mark.pybullet
 @pytest.mark.parametrize("name", ["Ram", "RamApart", "RamOtherNames"])
 def test_fields_that_fit(name):
-    assert read_source(name) == set()
+    assert found_in_source(f"{FILE}:{name}") == {}

@@ -7,7 +7,7 @@ from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from rlctl.checking.records import Records
 from rlctl.checking.rule import RuleFinding
 from rlctl.checking.rules import RULES
-from tests.checking.judging import case, check_case, findings, mark_slow, records_of
+from tests.checking.judging import case, check_case, findings, found_in_source, mark_slow
 
 TURNED = {
     "KiteDown": "RL124",
@@ -48,41 +48,36 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-def find_rules(task):
-    """The rules that find something in the lines alone."""
-    return {finding.rule for finding in records_of(task, "build", "expressions").facts[BY_EXPRESSIONS]}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TURNED)
 def test_a_line_turns_a_vector_the_wrong_way_or_leaves_out_an_element_of_the_action(name):
-    assert find_rules(f"broken_lines.py:{name}") == {TURNED[name]}
+    assert found_in_source(f"broken_lines.py:{name}").keys() == {TURNED[name]}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DINGHIES)
 def test_a_vector_of_the_world_is_observed_with_noise(name):
-    assert find_rules(f"broken_dinghies.py:{name}") == {"RL129"}
-    assert find_rules(f"broken_dinghies.py:{DINGHIES[name]}") == set()
+    assert found_in_source(f"broken_dinghies.py:{name}").keys() == {"RL129"}
+    assert found_in_source(f"broken_dinghies.py:{DINGHIES[name]}") == {}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMPARED)
 def test_a_line_compares_or_looks_up_the_wrong_ids(name):
     pytest.importorskip("mujoco")
-    assert find_rules(f"broken_ids.py:{name}") == {name[:5]}
+    assert found_in_source(f"broken_ids.py:{name}").keys() == {name[:5]}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["broken_lines.py:Kite", "broken_lines.py:Barge", "broken_lines.py:Skiff"])
 def test_their_twins_are_right(task):
-    assert find_rules(task) == set()
+    assert found_in_source(task) == {}
 
 
 @pytest.mark.slow
 def test_the_twin_that_compares_geoms_is_right():
     pytest.importorskip("mujoco")
-    assert find_rules("broken_ids.py:Biped") == set()
+    assert found_in_source("broken_ids.py:Biped") == {}
 
 
 @pytest.mark.slow

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from rlctl.checking.experiments.expressions import noted_episodes
-from rlctl.checking.instance import Budget, Context
 from rlctl.checking.paid_commands import CommandReader
 from rlctl.checking.paid_errors import ErrorReader
 from rlctl.checking.paid_goals import GoalReader
-from rlctl.checking.progress import read_clock
-from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import FOLDER, case, check_case, mark_slow
+from tests.checking.judging import case, check_case, mark_slow, notes_of
 
 pytest.importorskip("mujoco")
 FILE = "broken_paid.py"
@@ -39,10 +35,8 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 def note(name):
-    context = Context(EnvSpec(f"{FOLDER / FILE}:{name}"))
-    context.budget = Budget(read_clock() + 60.0)
-    with noted_episodes(context) as noted:
-        return noted
+    with notes_of(f"{FILE}:{name}") as notes:
+        return notes
 
 
 def test_the_summands_of_a_weighted_loop_have_names_and_weights():

@@ -2,13 +2,7 @@
 
 import pytest
 
-from rlctl.checking.experiments.expressions import note_expressions
-from rlctl.checking.instance import Budget, Context
-from rlctl.checking.progress import read_clock
-from rlctl.checking.records import Fact
-from rlctl.checking.rule import RuleFinding
-from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import FOLDER, case, check_case, mark_slow
+from tests.checking.judging import case, check_case, found_in_source, mark_slow
 
 FILE = "broken_previous.py"
 PAIRS = {
@@ -38,26 +32,16 @@ def test_finds_the_mistake_and_only_that(case):
     check_case(case)
 
 
-def read_source(name):
-    """Return the rules that find something in the expressions of a class, with the lines."""
-    context = Context(EnvSpec(f"{FOLDER / FILE}:{name}"))
-    context.budget = Budget(read_clock() + 100)
-    messages = list(note_expressions.run(context))
-    facts = [one for message in messages if isinstance(message, Fact) for one in message.value]
-    found = [one for one in [*messages, *facts] if isinstance(one, RuleFinding)]
-    return {one.rule: one.where for one in found}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAIRS)
 def test_reads_the_source(name):
-    found = read_source(name)
+    found = found_in_source(f"{FILE}:{name}")
     assert [*found] == [name[:5]]
-    file, line = found[name[:5]]
+    file, line = found[name[:5]].where
     assert file.endswith(FILE)
     assert line > 1
-    assert not read_source(PAIRS[name])
+    assert not found_in_source(f"{FILE}:{PAIRS[name]}")
 
 
 def test_the_rest_of_a_course_goes_on_without_a_jump():
-    assert not read_source("BoatRestOfCourse")
+    assert not found_in_source(f"{FILE}:BoatRestOfCourse")

@@ -18,7 +18,7 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import PROBE, experiment
 from rlctl.checking.instance import Context, Instance
 from rlctl.checking.loops import find_control_times, find_repeats
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
+from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Records
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.term_names import is_about_steps, is_paid
 from rlctl.checking.term_weights import find_action_terms, find_weighed_terms
@@ -80,6 +80,12 @@ class AttributeLog:
         """Return how rows change in each step. Shape (steps, columns)."""
         steps = np.flatnonzero(self.is_step)
         return np.asarray(rows[steps] - rows[steps - 1])
+
+
+def find_log_without_engine(records: Records) -> AttributeLog | None:
+    """Return what was logged of a robot without an engine; None where there is one, which tells more, or no log."""
+    log: AttributeLog | None = records.facts.get("attributes")
+    return log if log is not None and not np.isfinite(log.physics_s) else None
 
 
 @experiment("attributes", PROBE, 107, share=0.2)

@@ -5,22 +5,24 @@ import ast
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
-from rlctl.checking.expressions import ExpressionRecorder, Function, NotedCall, SourceCode, record_expressions
+from rlctl.checking.expressions import ExpressionRecorder, NotedCall, record_expressions
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, RuleFinding
+from rlctl.checking.source_code import Function, SourceCode
 from rlctl.checking.summands import RewardReader
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
 from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.wrong_turns import TurnedVectors
 
+Reader = TypeVar("Reader")
 EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
@@ -37,6 +39,7 @@ class NotedEpisodes:
     instance: Instance
     recorder: ExpressionRecorder
     _times: list[float] = dataclasses.field(default_factory=list)  # of what was played again [s]
+    _shared: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     def play(self, number: int, steps: int, forced: Mapping[int, Mapping[int, Any]]) -> list[tuple[NotedCall, Moment]]:
         """Play an episode again for some steps, in which expressions are worth what is given, by steps and by their
@@ -61,6 +64,13 @@ class NotedEpisodes:
             self._times.append(read_clock() - began)
         return played
 
+    def share(self, reader: Callable[["NotedEpisodes"], Reader]) -> Reader:
+        """Return what a class reads of the episodes, which is made once for all judges."""
+        if reader not in self._shared:
+            self._shared[reader] = reader(self)
+        found: Reader = self._shared[reader]
+        return found
+
     @functools.cached_property
     def definitions(self) -> Definitions:
         """What defines the expressions."""
@@ -69,16 +79,22 @@ class NotedEpisodes:
     @functools.cached_property
     def of_steps(self) -> Collection[ast.AST]:
         """The functions that steps run."""
-        return {self.source.expressions[number].function for call in self.steps for number in call.values}
+        return self._list_run(self.steps)
+
+    @functools.cached_property
+    def of_resets(self) -> Collection[ast.AST]:
+        """The functions that resets run."""
+        return self._list_run([episode[0] for episode in self.episodes])
 
     @functools.cached_property
     def functions(self) -> list[Function]:
         """All functions of the source that were run."""
-        calls = [call for episode in self.episodes for call in episode]
-        run = dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)
-        return list(run)
+        return list(self._list_run([call for episode in self.episodes for call in episode]))
 
-    @property
+    def _list_run(self, calls: Sequence[NotedCall]) -> dict[Function, None]:
+        return dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)
+
+    @functools.cached_property
     def steps(self) -> list[NotedCall]:
         """The steps of all episodes."""
         return [call for episode in self.episodes for call in episode[1:]]

@@ -11,7 +11,7 @@ from rlctl.checking import attitudes, wrong_turns
 from rlctl.checking.body_frames import BodyFrame, find_body_frames
 from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.attributes import AttributeLog, find_log_without_engine
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.fixed_directions import find_turned_directions, list_body_turns
@@ -71,8 +71,8 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 
 @judges_records(RULE, "worlds", "attributes")
 def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
-    log: AttributeLog | None = records.facts.get("attributes")
-    if log is not None and not np.isfinite(log.physics_s):  # an engine tells more
+    log = find_log_without_engine(records)
+    if log is not None:
         yield from find_wrong_turns(log)
 
 

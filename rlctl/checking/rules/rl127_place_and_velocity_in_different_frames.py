@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.experiment import RECORDING, judges_records
-from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.attributes import AttributeLog, find_log_without_engine
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
@@ -60,9 +60,9 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 @judges_records(RULE, *RECORDING, "worlds", "attributes")
 def _judge_records(records: Records) -> Iterator[RuleFinding]:
     """Yield what a robot without an engine shows: by its attributes, or where its heading is observed."""
-    log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
+    log = find_log_without_engine(records)
+    if log is None:
+        return
     if any(find_wrong_turns(log)):
         return  # RL124 tells which velocity it is
     built, seconds = records.require_built(), estimate_step(log)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.attributes import find_log_without_engine
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -89,9 +89,9 @@ def _read_steps(one: ObservedWorld) -> _Steps:
 
 @judges_records(RULE, "worlds", "attributes")
 def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
-    log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
+    log = find_log_without_engine(records)
+    if log is None:
+        return
     names, parts = name_elements(records.require_built())
     after = np.flatnonzero(log.is_step)
     turns = [turn.select(after) for turn in list_attribute_turns(log)]

@@ -8,7 +8,7 @@ from rlctl.checking import attitudes
 from rlctl.checking.body_frames import turn_plane
 from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import RECORDING, judges_records
-from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.attributes import find_log_without_engine
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.points_and_velocities import LoggedPlace, LoggedVelocity, list_places_of
 from rlctl.checking.readings import NEARLY_ALL
@@ -49,9 +49,9 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 
 @judges_records(RULE, *RECORDING, "worlds", "attributes")
 def _judge_records(records: Records) -> Iterator[RuleFinding]:
-    log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
+    log = find_log_without_engine(records)
+    if log is None:
+        return
     matrices = [turn.matrices for turn in list_attribute_turns(log)]
     for size in (3, 2):
         found = _find_point(log.observed, *list_places_of(log, size, matrices), sizes=(size,))

@@ -263,13 +263,13 @@ def _judge_stops(finished: CheckedEpisode, stops: Sequence[Stop]) -> Iterator[Ch
 @judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
 def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Read what the source pays for success, and what it pays in each step next to the goal."""
-    reader = GoalReader(notes)
+    reader = notes.share(GoalReader)
     for summand, number, income in reader.find_replaced():
         message = f"success replaces the reward by {number:.4g}, and a step next to the goal pays up to {income:.4g}"
         evidence = {"value": number, "expected": f"above {income:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
         return
-    low = SuccessReader(reader).find()
+    low = SuccessReader(notes).find()
     if low is not None:
         message = (
             f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"

@@ -367,13 +367,12 @@ def _exceeds(rewards: Sequence[float], inside: _Outcome) -> bool:
 @judges_expressions(RULE, place=1, decides=False)  # after others: it plays much
 def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first summand of the reward whose sign pays for a distance."""
-    reader = GoalReader(notes)
-    for paid in reader.find_wrong_signs():
+    for paid in notes.share(GoalReader).find_wrong_signs():
         text, weight = ast.unparse(paid.place.node), paid.summand.weight
         message = f"{paid.how} in the source of the reward: {text} counts {weight:+.4g} times"
         yield RuleFinding(RULE, message, {"element": paid.summand.name}, where=notes.reward.locate(paid.place))
         return
-    for rise in RiseReader(reader).find_rises():
+    for rise in RiseReader(notes).find_rises():
         (close, near), (away, far) = rise.near, rise.far
         message = (
             f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"

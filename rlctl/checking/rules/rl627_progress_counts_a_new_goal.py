@@ -10,7 +10,6 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_draws import GoalDraws
 from rlctl.checking.goal_episodes import HELD_STEPS, PLACED_STEPS, GoalEpisode, GoalTrials
-from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -48,7 +47,7 @@ class _Switch(NamedTuple):
 
 @judges_expressions(RULE, decides=False)
 def _find_jumps(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one in GoalDraws(KeptDifferences(noted)).find_jumps():
+    for one in noted.share(GoalDraws).find_jumps():
         difference = one.difference
         when = f"in which {one.key} changes" if one.at_once else f"after {one.key} has changed"
         message = f"in the step {when}, {difference.whole.text} is up to {one.jump:.3g}, and at most"

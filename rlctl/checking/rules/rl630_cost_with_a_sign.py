@@ -197,7 +197,7 @@ def _is_sum(value: ast.expr, names: set[str]) -> bool:
 @judges_expressions(RULE, decides=False)
 def _find_sums_of_the_source(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first cost of the source that is a sum with signs, by what it was worth."""
-    for summand, place in ErrorReader(notes).find_sums():
+    for summand, place in notes.share(ErrorReader).find_sums():
         paid = summand.weight * notes.reward.numbers.list_values(place.node)
         message = f"reward term {summand.name!r} is a cost, and {ast.unparse(place.node)} adds up numbers with their"
         message += f" signs: it costs up to {-paid.min():.4g} and pays up to {paid.max():.4g}"

@@ -41,7 +41,7 @@ def _find_unpaid(trials: CommandTrials) -> Iterator[ChildMessage]:
 @judges_expressions(RULE, decides=False)
 def _find_unread(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first number of a command that is compared with two things, while another is with none."""
-    for same, unpaid in CommandReader(notes).find_unpaid():
+    for same, unpaid in notes.share(CommandReader).find_unpaid():
         command, index = same[0].command, same[0].index
         names = list_names(list(dict.fromkeys(one.summand.name for one in same)))
         message = f"the reward compares {command}[{index}] in {names}, and {command}[{unpaid}] with nothing:"
@@ -49,7 +49,7 @@ def _find_unread(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         evidence = {"element": f"{command}[{unpaid}]"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(same[-1].place))
         return
-    for one in SizeReader(notes).find_always_met():
+    for one in notes.share(SizeReader).find_always_met():
         message = (
             f"reward term {one.summand.name!r} is at least {one.least:.4g} of 1 in all steps, whatever the command"
         )

@@ -105,12 +105,12 @@ def _pay(trials: CommandTrials, place: DrawnPlace, seed: int, command: Numbers) 
 @judges_expressions(RULE, decides=False)
 def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first difference of lengths in the source of the reward."""
-    for summand, place in CommandReader(notes).find_lengths():
+    for summand, place in notes.share(CommandReader).find_lengths():
         message = f"reward term {summand.name!r} compares lengths only, and nothing compares the direction:"
         message += f" {ast.unparse(place.node)}"
         yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(place))
         return
-    for one in SizeReader(notes).find_one_sided():
+    for one in notes.share(SizeReader).find_one_sided():
         message = (
             f"reward term {one.summand.name!r} compares a command that has both signs with {ast.unparse(one.size)},"
         )

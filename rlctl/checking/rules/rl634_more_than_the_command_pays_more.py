@@ -68,7 +68,7 @@ def _describe(sweep: CommandSweep) -> str:
 @judges_expressions(RULE, decides=False)
 def _find_signed_errors(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first difference that the source pays with its sign, and the first even power of a cosine."""
-    reader = ErrorReader(notes)
+    reader = notes.share(ErrorReader)
     for error in reader.find_errors():
         text, name = ast.unparse(error.place.node), error.summand.name
         values = notes.reward.numbers.list_values(error.place.node)

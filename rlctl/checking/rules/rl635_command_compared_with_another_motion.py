@@ -182,7 +182,7 @@ def _differs(found: _Motions, motion: Array) -> bool:
 @judges_expressions(RULE, decides=False)
 def _find_other_axis(notes: NotedEpisodes) -> Iterator[ChildMessage]:
     """Yield the first number of a velocity along another axis than the names say."""
-    for summand, named, text, axis in CommandReader(notes).find_other_axes():
+    for summand, named, text, axis in notes.share(CommandReader).find_other_axes():
         message = (
             f"reward term {summand.name!r} compares {text} with what is called {named!r}, which is about axis {axis}"
         )

@@ -23,7 +23,7 @@ RULE = Rule(
 
 @judges_expressions(RULE, decides=False)
 def _find_differences(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one in KeptDifferences(noted).find_never_replaced():
+    for one in noted.share(KeptDifferences).find_never_replaced():
         message = f"{one.key} stays what it was at the start in {len(noted.steps)} steps, and each of them pays"
         message += f" {one.whole.text}: not what has changed in the step, but since the start or the last goal"
         yield RuleFinding(RULE, message, {"element": one.key}, where=one.whole.where)

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from rlctl.checking.action_trials import REWARD, Frame, Trials
 from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.goal_draws import GoalDraws
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
-from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.stale_values import StaleValues
@@ -29,7 +27,7 @@ RULE = Rule(
         while the same episode was played: in the same steps only one of them changed the observations, and only
         another one changed the rewards. Or reset copies a goal or a command into another attribute, and steps still
         read the copy after another one was drawn: the check let the condition be true under which that happens. Or only
-        the first reset computes a value, as under `if self.goal is None`, from another one that each reset sets anew.
+        the first reset computes a value, as under `if self.goal is None`, from another one that each reset sets.
     """,
     fix="Choose the goal in one place, which the observation, the reward and the success read.",
 )
@@ -42,13 +40,13 @@ SAME = 1e-6  # differences that do not count, of the numbers or of 1
 
 @judges_expressions(RULE, decides=False)
 def _find_stale_copies(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    stale = StaleValues(GoalDraws(KeptDifferences(noted)))
+    stale = noted.share(StaleValues)
     for one in stale.find_stale_copies():
         message = f"reset copies {one.goal} into {one.copy}, which steps still read after {one.goal} has changed:"
         message += f" {one.read.text} is then that of the last {one.goal}"
         yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
     for one in stale.find_first_only():
-        message = f"only the first reset computes {one.copy} from {one.goal}, and each reset sets {one.goal} anew:"
+        message = f"only the first reset computes {one.copy} from {one.goal}, and each reset sets another {one.goal}:"
         message += f" {one.read.text} is that of the first episode"
         yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
 

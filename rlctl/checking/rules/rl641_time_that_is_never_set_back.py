@@ -4,8 +4,6 @@ import ast
 from collections.abc import Iterator
 
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.goal_draws import GoalDraws
-from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.stale_values import StaleValues
 
@@ -25,7 +23,7 @@ RULE = Rule(
 
 @judges_expressions(RULE)
 def _find_never_set_back(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one in StaleValues(GoalDraws(KeptDifferences(noted))).find_never_set_back():
+    for one in noted.share(StaleValues).find_never_set_back():
         name = ast.unparse(one.target)
         message = f"{name} goes on under a condition, and no step sets it back where that does not hold"
         place = noted.source.find_place(one.statement)

@@ -7,8 +7,8 @@ import numpy as np
 
 from rlctl.checking.early_readings import EarlyReadings
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.source_code import write_code
 
 RULE = Rule(
     "RL642",
@@ -17,8 +17,8 @@ RULE = Rule(
     meaning="""
         A reset keeps where the robot starts, such as its heading, its height or its distance to the goal, and places
         the robot or the goal only afterwards. What is kept is that of the last episode, or of the model as it was
-        built, and what steps subtract from it, such as progress or a turn, is wrong by a number that each episode has
-        anew. The check evaluated the expression once more at the end of the reset, and it was another number.
+        built, and what steps subtract from it, such as progress or a turn, is wrong by another number in each
+        episode. The check evaluated the expression once more at the end of the reset, and it was another number.
     """,
     fix="Read it at the end of reset, after all is placed; in MuJoCo after mj_forward, too.",
 )
@@ -26,8 +26,8 @@ RULE = Rule(
 
 @judges_expressions(RULE)
 def _find_early(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one in EarlyReadings(KeptDifferences(noted)).find():
-        text = " ".join(ast.unparse(one.assignment.statement).split())
+    for one in EarlyReadings(noted).find():
+        text = write_code(one.assignment.statement)
         message = f"{text} reads {_write(one.kept)}, and at the end of the same reset {one.value.text} is"
         message += f" {_write(one.later)}: what it is computed from is set afterwards, and {one.difference.whole.text}"
         message += " is wrong from the first step on"

@@ -16,7 +16,7 @@ from rlctl.checking.derived_fields import (
     find_stale_fields,
 )
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.attributes import AttributeLog
+from rlctl.checking.experiments.attributes import find_log_without_engine
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
@@ -86,9 +86,9 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 @judges_records(RULE, "worlds", "attributes", "action effects")
 def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
     """Yield the vectors that a robot without an engine observes from where it was a step before."""
-    log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
+    log = find_log_without_engine(records)
+    if log is None:
+        return
     if any(finding.rule == "RL115" for finding in records.findings):
         return  # all that is observed is late
     names, parts = name_elements(records.require_built())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.engine_values import NOISY, NOISY_FACTOR, EngineValues, explain, is_white
 from rlctl.checking.experiment import judges_records
-from rlctl.checking.experiments.attributes import AttributeLog, find_weights
+from rlctl.checking.experiments.attributes import find_log_without_engine, find_weights
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.joint_copies import LEAST_MOTION
 from rlctl.checking.readings import MOST_ELEMENTS, name_features, read_features
@@ -102,9 +102,9 @@ def _judge_records(records: Records) -> Iterator[RuleFinding]:
 
 def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
     """Yield what a robot without an engine tells."""
-    log: AttributeLog | None = records.facts.get("attributes")
-    if log is None or np.isfinite(log.physics_s):
-        return  # the engine tells more
+    log = find_log_without_engine(records)
+    if log is None:
+        return
     try:
         times = require_step_times(log)
     except NotApplicable:

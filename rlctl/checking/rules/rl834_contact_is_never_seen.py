@@ -1,6 +1,5 @@
 """RL834: contact is never seen."""
 
-import ast
 import itertools
 from collections.abc import Iterator
 from typing import Any
@@ -17,6 +16,7 @@ from rlctl.checking.mujoco_worlds import MujocoStateReader, library
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_others
 from rlctl.checking.shared_frames import name_observed
+from rlctl.checking.source_code import write_code
 from rlctl.checking.term_names import is_paid, split_name
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array
@@ -59,10 +59,10 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
 def _find_distances(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     """Yield where the distance of a contact point has to be larger than it can be, as a force has to."""
     for node, least in find_taken_for_force(noted.definitions, noted.functions, noted.reward.numbers):
-        text = " ".join(ast.unparse(node).split())
+        text = write_code(node)
         message = f"{text} is never true: field 8 of a contact point is the distance, below 0 where bodies touch, and"
         message += f" {least:g} m apart there is no contact; the normal force is field 9"
-        place = noted.source.find_place(noted.source.find_statement(node))[0], node.lineno
+        place = noted.source.find_place(node)
         yield RuleFinding(RULE, message, {"element": text, "value": least}, where=place)
 
 

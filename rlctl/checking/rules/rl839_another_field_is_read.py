@@ -32,6 +32,6 @@ def _find_other_fields(noted: NotedEpisodes) -> Iterator[RuleFinding]:
                 continue
             meaning, called, place = found
             message = f"{name} is field {read.field} of {read.function}, {meaning}: the {called} is field {place}"
-            where = source.find_place(source.find_statement(read.node))[0], read.node.lineno
+            where = source.find_place(read.node)
             yield RuleFinding(RULE, message, {"element": name, "value": read.field}, where=where)
             return
