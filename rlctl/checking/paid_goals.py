@@ -36,13 +36,12 @@ class WrongSign(enum.StrEnum):
     """How the sign of a summand is wrong."""
 
     NEARNESS_COSTS = "nearness costs"
-    DISTANCE_PAYS = "distance pays"
     LEAVING_PAYS = "leaving pays"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PaidDistance:
-    """A summand that pays for being away from a goal, or for going away from it."""
+    """A summand that costs for being near a goal, or pays for going away from it."""
 
     how: WrongSign
     summand: Summand
@@ -58,7 +57,7 @@ class GoalReader:
         self.definitions = notes.reward.definitions
 
     def find_wrong_signs(self) -> Iterator[PaidDistance]:
-        """Yield summands that pay for the distance to a goal."""
+        """Yield them; what rises with a distance is found by playing, in `paid_distances`."""
         for summand in self.reward.summands:
             if self._is_avoided(summand):
                 continue
@@ -66,8 +65,6 @@ class GoalReader:
                 words = self._list_words(summand)
                 if words & (NEAR_WORDS | WANTED_WORDS):
                     yield PaidDistance(WrongSign.NEARNESS_COSTS, summand, summand.place)
-            if summand.weight > 0 and self._is_distance_to_goal(summand.place) and not self.is_of_progress(summand):
-                yield PaidDistance(WrongSign.DISTANCE_PAYS, summand, summand.place)
         for summand in self.reward.differences:
             if not self._is_avoided(summand) and self._pays_leaving(summand):
                 yield PaidDistance(WrongSign.LEAVING_PAYS, summand, summand.place)
@@ -96,21 +93,6 @@ class GoalReader:
             case ast.Call(func=function) if read_name(function) in SUMS:
                 summed = read_summed(resolved.node)
                 return summed is not None and self._is_nearness(resolved.at(summed))
-        return False
-
-    def _is_distance_to_goal(self, place: ReadExpression) -> bool:
-        """Say whether it is the length of a difference of a goal and something else."""
-        resolved = self.definitions.resolve(place)
-        match resolved.node:
-            case ast.Call(func=function, args=[only, *_]) if read_name(function) == "norm":
-                inner = self.definitions.resolve(resolved.at(only))
-            case ast.Call(func=function, args=[one, two]) if read_name(function) in ("dist", "distance"):
-                return self.errors.is_wanted(resolved.at(one)) != self.errors.is_wanted(resolved.at(two))
-            case _:
-                return False
-        match inner.node:
-            case ast.BinOp(left=left, op=ast.Sub(), right=right):
-                return self.errors.is_wanted(inner.at(left)) != self.errors.is_wanted(inner.at(right))
         return False
 
     def is_of_progress(self, summand: Summand) -> bool:
