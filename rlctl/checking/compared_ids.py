@@ -14,7 +14,7 @@ from rlctl.checking.term_names import split_name
 
 KINDS = {"geom": "geom", "body": "body", "joint": "joint", "jnt": "joint", "site": "site", "actuator": "actuator"}
 LOADERS = {"loadURDF", "createMultiBody", "loadMJCF", "loadSDF"}
-BODY, LINK = (1, 2), (3, 4)  # fields of a contact point of PyBullet
+POINT_KINDS = {1: {"body"}, 2: {"body"}, 3: {"link"}, 4: {"link"}}  # by fields of a contact point of PyBullet
 LOOKUPS = {"id", "name2id", "index", "find", "link", "joint", "geom", "body", "site", "sensor", "actuator"}
 FEWEST = 10
 DEEPEST = 6  # assignments that are followed
@@ -36,7 +36,7 @@ class Ids:
             case ast.Subscript(value=ast.Attribute(attr="geom", value=ast.expr() as owner)) if self.is_contact(owner):
                 return {"geom"}
             case ast.Subscript(value=owner, slice=ast.Constant(value=int(field))) if self.is_point(owner):
-                return {"body"} if field in BODY else {"link"} if field in LINK else set()
+                return POINT_KINDS.get(field, set())
             case ast.Subscript(value=ast.Attribute(attr=name)) if name in ("geom_bodyid", "body_rootid", "site_bodyid"):
                 return {"body"}
             case ast.Attribute(attr="id", value=ast.Call(func=ast.Attribute(attr=name))) if name in KINDS:
