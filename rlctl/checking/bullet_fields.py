@@ -47,6 +47,7 @@ PASSED_ON = {
 }
 DEEPEST = 6
 DISTANCE, FARTHEST = 8, 0.02  # field of a contact point, and how far apart the bodies of one are at most [m]
+NORMAL_FORCE = "Compare the normal force, field 9 of a contact point, with the threshold."
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,7 +5,7 @@ import collections
 from collections.abc import Collection, Iterator, Sequence
 
 from rlctl.checking.assignments import CONVERSIONS, read_name
-from rlctl.checking.bullet_fields import DISTANCE, BulletFields
+from rlctl.checking.bullet_fields import DISTANCE, NORMAL_FORCE, BulletFields
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.rule import Rule, RuleFinding
@@ -102,7 +102,8 @@ def find_wrong_ids(
                     message += (
                         " contact point is the distance, and below 0 where bodies touch; the normal force is field 9"
                     )
-                    yield RuleFinding(rule, message, {"element": one.text, "value": len(values)}, where=one.where)
+                    evidence = {"element": one.text, "value": len(values)}
+                    yield RuleFinding(rule, message, evidence, fix=NORMAL_FORCE, where=one.where)
 
 
 def _open_literal(node: ast.expr) -> list[ast.expr]:

@@ -27,7 +27,6 @@ class RisingReward:
 
     distance: GoalDistance
     place: ReadExpression
-    name: str
     near: tuple[float, float]  # the distance, and the reward
     far: tuple[float, float]
 
@@ -89,8 +88,7 @@ class RiseReader:
             return None
         place = rising[0].place if rising else ReadExpression(one.expression.node, one.expression.function, {})
         paid = [self._pay(one, number, last, PARTS[part]) for part in (LOW, HIGH)]
-        name = rising[0].name if rising else "the reward"
-        return RisingReward(one, place, name, (distances[0], paid[0]), (distances[1], paid[1]))
+        return RisingReward(one, place, (distances[0], paid[0]), (distances[1], paid[1]))
 
     def _is_rising(self, summand: Summand, before: NotedCall, after: NotedCall) -> bool:
         if math.isnan(summand.weight) or self.goals.is_of_progress(summand):

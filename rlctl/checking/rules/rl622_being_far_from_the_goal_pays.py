@@ -378,6 +378,6 @@ def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
             f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"
         )
         message += f" the same steps pay {near:.4g} where it is {close:.3g}, and {far:.4g} where it is {away:.3g}"
-        evidence = {"element": rise.name, "value": far, "expected": f"below {near:.6g}"}
+        evidence = {"element": rise.distance.expression.text, "value": far, "expected": f"below {near:.6g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(rise.place))
         return

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.bullet_fields import find_taken_for_force
+from rlctl.checking.bullet_fields import NORMAL_FORCE, find_taken_for_force
 from rlctl.checking.compared_ids import find_wrong_ids
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -63,7 +63,7 @@ def _find_distances(noted: NotedEpisodes) -> Iterator[RuleFinding]:
         message = f"{text} is never true: field 8 of a contact point is the distance, below 0 where bodies touch, and"
         message += f" {least:g} m apart there is no contact; the normal force is field 9"
         place = noted.source.find_place(node)
-        yield RuleFinding(RULE, message, {"element": text, "value": least}, where=place)
+        yield RuleFinding(RULE, message, {"element": text, "value": least}, fix=NORMAL_FORCE, where=place)
 
 
 @judges_trials(RULE, place=31)
