@@ -269,7 +269,8 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         evidence = {"value": number, "expected": f"above {income:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
         return
-    low = SuccessReader(notes).find()
+    successes = SuccessReader(notes)
+    low = successes.find()
     if low is not None:
         message = (
             f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
@@ -278,8 +279,10 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         evidence = {"value": low.success, "expected": f"above {low.before:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(low.paid))
         return
-    income, bonus = reader.read_income(), reader.read_bonus()
-    if bonus is not None and income > 0 and reader.ends_at_success():
+    if not reader.ends_at_success():
+        return
+    income, bonus = successes.read_incomes() or (reader.read_income(), reader.read_bonus())
+    if bonus is not None and income > 0:
         yield Fact(IN_SOURCE, (income, bonus, reader.pays_for_time()))
 
 
