@@ -119,8 +119,10 @@ class KeptDifferences:
         )
 
     def comes_with_goal(self, assignment: Assignment) -> bool:
-        """Say whether an assignment stands under an `if`, or in a function, that also sets a goal."""
+        """Say whether an assignment stands under an `if`, or in a function besides `step`, that also sets a goal."""
         conditions = self.definitions.list_conditions(assignment.statement)
+        if not conditions and assignment.function is self.definitions.find_function("step"):
+            return False
         blocks: list[Sequence[ast.AST]] = [] if conditions else [assignment.function.body]
         for test, is_met in conditions:
             branch = self.noted.source.parents[test]

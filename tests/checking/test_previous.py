@@ -2,7 +2,8 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, found_in_source, mark_slow
+from rlctl.checking.previous_values import KeptDifferences
+from tests.checking.judging import case, check_case, found_in_source, mark_slow, notes_of
 
 FILE = "broken_previous.py"
 PAIRS = {
@@ -45,3 +46,11 @@ def test_reads_the_source(name):
 
 def test_the_rest_of_a_course_goes_on_without_a_jump():
     assert not found_in_source(f"{FILE}:BoatRestOfCourse")
+
+
+def test_a_target_of_a_motor_in_the_same_step_is_no_new_goal():
+    with notes_of(f"{FILE}:BoatStrides") as notes:
+        kept = notes.share(KeptDifferences)
+        in_step = [one for one in notes.definitions.assigned["last_error"] if one.function.name == "step"]
+        assert in_step
+        assert not any(map(kept.comes_with_goal, in_step))
