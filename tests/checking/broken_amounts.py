@@ -226,6 +226,18 @@ class RL630PuckLeans(Puck):
         return reward
 
 
+class PuckWearsBothSides(Puck):
+    def pay(self, action):
+        uneven = 0.2 * abs(action[0] - action[1])
+        return 1 - self.gap() - uneven
+
+
+class PuckWearsOneSide(Puck):
+    def pay(self, action):
+        uneven = 0.2 * (action[0] - action[1])
+        return 1 - self.gap() - uneven
+
+
 class PuckIsStraight(Puck):
     def pay(self, action):
         terms = {

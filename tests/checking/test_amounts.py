@@ -70,6 +70,7 @@ def find_always_met(notes):
         ("PuckReturnsLittle", "PuckReturns", find_low_successes),
         ("RL630PuckLeans", "PuckIsLevel", find_signed),
         ("PuckTurnsLeft", "PuckIsStraight", find_signed),
+        ("PuckWearsOneSide", "PuckWearsBothSides", find_signed),
         ("RL633PuckOnlySpeeds", "PuckFollows", find_one_sided),
         ("PuckTurnsEitherWay", "PuckTurnsAsTold", find_one_sided),
         ("RL632PuckIsAlwaysRight", "PuckIsTolerant", find_always_met),
