@@ -90,7 +90,7 @@ class UnwrappedAngles:
             for call in self._calls
             if side.number in call.values and other.number in call.values
         ]
-        if len(pairs) < FEWEST_CALLS or any(np.shape(a) != np.shape(b) or None in (a, b) for a, b in pairs):
+        if len(pairs) < FEWEST_CALLS or any(a is None or b is None or np.shape(a) != np.shape(b) for a, b in pairs):
             return False
         a, b = np.array(pairs, np.float64).reshape(len(pairs), 2, -1).transpose(1, 0, 2)
         return bool(np.abs(a - b).max() <= SAME and np.ptp(a, axis=0).min() > 0)
