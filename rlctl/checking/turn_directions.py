@@ -87,7 +87,7 @@ class Directions:
         if usable.sum() < FEWEST:
             return None
         found = []
-        for one, rows in self._angles:
+        for one, rows in self.angles:
             if rows.shape[1] not in (1, angles.shape[1]):
                 continue
             known = np.broadcast_to(rows, angles.shape)
@@ -110,11 +110,11 @@ class Directions:
                 order = WXYZ if "mujoco" in self._libraries else XYZW
                 yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
                 return yaw.reshape(rows.shape[:2])
-        angles = [rows for one, rows in self._angles if one.text == text]
+        angles = [rows for one, rows in self.angles if one.text == text]
         return max(angles, key=lambda rows: np.isfinite(rows).sum(), default=None)  # some are read at resets only
 
     @functools.cached_property
-    def _angles(self) -> list[tuple[Expression, Array]]:
+    def angles(self) -> list[tuple[Expression, Array]]:
         """What is called an angle about the vertical, and is no argument: that may be another one's opposite."""
         kinds = ast.Name | ast.Attribute | ast.Subscript | ast.Call
         named = [one for one in self.series.source.expressions if isinstance(one.node, kinds)]
@@ -134,18 +134,22 @@ class Directions:
             call = parents[call]
         return not isinstance(one.node, ast.Call) and isinstance(call, ast.Call) and one.node is not call.func
 
+    @functools.cached_property
+    def _places(self) -> list[Array]:
+        places = [rows for one, rows in self.series.vectors if is_place(one) or is_of_engine(one)]
+        places += [side for way in self.series.differences for side in way.sides]
+        return list({rows.tobytes(): rows for rows in places}.values())
+
     def counts_forwards(self, text: str) -> bool:
         """Say whether the motion of the robot shows that a rotation by an angle is the one from it to the world."""
-        return any(self._grows(rows) for one, rows in self._angles if one.text == text)
+        return any(self._grows(rows) for one, rows in self.angles if one.text == text)
 
     def _grows(self, angles: Array) -> bool:
         """Say whether a place goes round the vertical as an angle grows, or moves straight ahead by it."""
         if np.nanstd(angles) < LEAST_SPREAD:
             return False
         turned = np.diff(angles, axis=0)
-        places = [rows for one, rows in self.series.vectors if is_place(one) or is_of_engine(one)]
-        places += [side for way in self.series.differences for side in way.sides]
-        for rows in (rows for rows in places if rows.shape[:2] == angles.shape):
+        for rows in (rows for rows in self._places if rows.shape[:2] == angles.shape):
             x, y = np.diff(rows[..., :2], axis=0).transpose(2, 0, 1)
             round_it = np.diff(np.arctan2(rows[..., 1], rows[..., 0]), axis=0)
             ahead = np.arctan2(y, x)

@@ -45,7 +45,7 @@ def find_turns(series: VectorSeries) -> Iterator[VectorTurn]:
                 parts += [function.value] if isinstance(function, ast.Attribute) else []
             case ast.Subscript(value=ast.Call(args=args)):
                 parts = [*args]
-            case ast.Name():
+            case ast.Name() if any(series.read(one.node, size=size) is not None for size in (2, 3)):
                 parts = _list_arguments(one)
         for part, size in itertools.product(parts, (2, 3)):
             before, after = series.read(part, size=size), series.read(one.node, size=size)

@@ -29,6 +29,7 @@ NO_CHANGES = {
     *("subtract", "arange", "range", "print", "zip"),
 }
 """Functions of two values that are no change from the one to the other, or are read as such already."""
+MOST_STEPS = 80  # that are looked at
 LATER = 3  # steps in which what is kept may show
 
 
@@ -65,12 +66,13 @@ class ZeroDifferences:
         """Yield values that a step keeps, such as filtered ones, of differences that are 0 whenever they are computed
         for them, and not elsewhere."""
         others = [one for one in self._candidates if one not in self._always]
+        steps = self.noted.steps[:: max(1, len(self.noted.steps) // MOST_STEPS)] if others else []
         for key, assignments in self.definitions.assigned.items():
             for one in assignments:
                 value = self.noted.source.find(one.value)
-                if value is None or one.function not in self.noted.of_steps or is_previous_key(key):
+                if value is None or not others or one.function not in self.noted.of_steps or is_previous_key(key):
                     continue
-                runs = [list(_list_runs(self.noted, call, value)) for call in self.noted.steps]
+                runs = [list(_list_runs(self.noted, call, value)) for call in steps]
                 found = [difference for difference in others if self._is_zero(runs, difference)]
                 if found and key not in {difference.key for difference in others} and self._shows(value):
                     yield ZeroUpdate(one.statement, value, found[0])
