@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import functools
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -27,6 +28,12 @@ MEANT_WORDS = {
 """What names a value that is meant to be older."""
 DONE_WORDS = {"action", "actions", "torque", "torques", "ctrl", "effort"}
 STATES = {"qpos", "qvel", "mocap", "xfrc", "qfrc"}  # of MuJoCo
+ENGINE = (
+    r"\b(qpos|qvel|qacc|xi?pos|xquat|xmat|cvel|sensordata|(site|geom)_x\w+|subtree_\w+|get(Base|Link|Joint|Contact)\w+"
+    r"|mj_object\w+|(base|link)_(position|orientation|velocity|angular_velocity)|joint_(positions|velocities))\b"
+)
+"""What MuJoCo, PyBullet and the robots of tasks return of the state."""
+DEEPEST = 3  # attributes that are computed from others
 FEWEST, MOST_CALLS = 20, 60  # steps
 NEARLY_ALL, SOME = 0.9, 0.1  # parts of them
 SAME = 1e-9  # relative
@@ -92,7 +99,51 @@ class LateReadings:
         sources = self.definitions.list_sources(one.value, one.function)
         if any(self._is_meant(top, function) for top, function in sources):
             return False
-        return name not in self.definitions.list_reads(one.value, one.function)
+        return name not in self._list_reads(one) and (bool(self._list_own_moves(one)) or self._reads_engine(one))
+
+    def _list_reads(self, one: Assignment) -> set[str]:
+        """Return the keys of the attributes that a value is computed from, also of what is unpacked for it."""
+        tops = [one.value, *self._list_unpacked(one)]
+        return {key for top in tops for key in self.definitions.list_reads(top, one.function)}
+
+    def _list_unpacked(self, one: Assignment) -> Iterator[ast.expr]:
+        """Yield what the names of a value are unpacked from, and the calls that are given them to write into."""
+        names = {
+            node.id
+            for top, function in self.definitions.list_sources(one.value, one.function)
+            for node in ast.walk(top)
+            if isinstance(node, ast.Name) and function is one.function
+        }
+        for name in names:
+            yield from (other.value for other in self.definitions.list_assigned(one.function).get(name, ()))
+        for node in ast.walk(one.function):
+            if isinstance(node, ast.Call) and any(isinstance(arg, ast.Name) and arg.id in names for arg in node.args):
+                yield node
+
+    def _reads_engine(self, one: Assignment) -> bool:
+        """Say whether a value is computed from what an engine moves."""
+        tops = [one.value, *self._list_unpacked(one)]
+        return any(
+            re.search(ENGINE, ast.unparse(inner))
+            for top in tops
+            for inner, _ in self.definitions.list_sources(top, one.function)
+        )
+
+    @functools.cached_property
+    def _driven(self) -> set[str]:
+        """The keys of the attributes that steps compute from the action, or from others that they do."""
+        assigned = [
+            (key, {name for top, _ in sources for name in list_name_words(top)}, reads)
+            for key, several in self.definitions.assigned.items()
+            for one in several
+            if one.function in self.noted.of_steps
+            for sources in [self.definitions.list_sources(one.value, one.function)]
+            for reads in [self._list_reads(one)]
+        ]
+        driven = {key for key, words, _ in assigned if words & DONE_WORDS}
+        for _ in range(DEEPEST):
+            driven |= {key for key, _, reads in assigned if reads & driven}
+        return driven
 
     def _is_meant(self, top: ast.AST, function: ast.AST) -> bool:
         """Say whether code has an action, chance or the time."""
@@ -124,9 +175,9 @@ class LateReadings:
 
     def _list_own_moves(self, one: Assignment) -> set[int]:
         """Return the expressions that steps assign to what a value is computed from, but for an engine's arrays."""
-        keys = self.definitions.list_reads(one.value, one.function)
+        keys = self._list_reads(one)
         others = TIME_NAMES | ACTION_WORDS | STATES | PREVIOUS_WORDS
-        keys = {key for key in keys if not read_words(key) & others and not is_goal(key)}
+        keys = {key for key in keys & self._driven if not read_words(key) & others and not is_goal(key)}
         own = [other for key in keys for other in self.definitions.assigned.get(key, ())]
         values = [self.noted.source.find(other.value) for other in own if other.function in self.noted.of_steps]
         return {value.number for value in values if value is not None}

@@ -80,6 +80,22 @@ class CrabSteersByIt(Crab):
         self.look()
 
 
+class CrabKeepsTime(Crab):
+    """It turns its own clock before it moves."""
+
+    def start(self):
+        super().start()
+        self.beat = np.array([0.0, 1.0])
+
+    def move(self, action):
+        sine, cosine = self.beat
+        self.beat = np.array([0.9 * sine + 0.435 * cosine, 0.9 * cosine - 0.435 * sine])
+        super().move(action)
+
+    def observe(self):
+        return np.concatenate([self.velocity, self.way, self.shell, self.beat, self.data.qvel[2:3]]).astype(np.float32)
+
+
 class CrabKeepsAView(Crab):
     """What it reads before it moves is a view of what MuJoCo changes."""
 

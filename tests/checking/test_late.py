@@ -31,7 +31,7 @@ def test_finds_what_is_read_too_early(name):
 
 @pytest.mark.slow
 @pytest.mark.pybullet
-@pytest.mark.parametrize("name", ["CrabSteersByIt", "CrabKeepsAView", "SnailRemembers", "SnailGains"])
+@pytest.mark.parametrize("name", ["CrabSteersByIt", "CrabKeepsAView", "CrabKeepsTime", "SnailRemembers", "SnailGains"])
 def test_what_is_read_again_or_meant_to_be_older(name):
     assert not found_in_source(f"{FILE}:{name}")
 
