@@ -51,7 +51,7 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
             continue
         is_angle = turn.before.shape[2] == 2 or by not in rights_3d
         is_told = bool(list_words(turn.whole.node) & WORLD_WORDS) or by in rights or directions.has_engine
-        if is_angle and not is_told:
+        if is_angle and not is_told and not directions.counts_forwards(by):
             continue  # the angle may count the other way round, as that of a compass
         seen.add(turn.whole.number)
         if what.startswith("the way") == of_ways:
