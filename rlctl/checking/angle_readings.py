@@ -272,8 +272,9 @@ class AngleReadings:
                         case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)):
                             for element, (target, value) in enumerate(zip(targets, values, strict=False)):
                                 found.setdefault(read_name(target), []).append((value, element))
-                        case ast.Assign(targets=[target], value=value) | ast.AnnAssign(
-                            target=target, value=ast.expr() as value
+                        case (
+                            ast.Assign(targets=[target], value=value)
+                            | ast.AnnAssign(target=target, value=ast.expr() as value)
                         ):
                             found.setdefault(read_name(target), []).append((value, None))
         return found

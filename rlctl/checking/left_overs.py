@@ -87,7 +87,11 @@ class LeftOvers:
     def find_fields(self) -> Iterator[LeftOver]:
         """Yield fields of MuJoCo's data that steps set under a condition, and resets never."""
         called = {name for one in self._resets for name in _list_calls(one)}
-        if DATA_RESETS & called or hasattr(self.source.author, "reset_model") or not hasattr(self.source.author, "step"):
+        if (
+            DATA_RESETS & called
+            or hasattr(self.source.author, "reset_model")
+            or not hasattr(self.source.author, "step")
+        ):
             return
         for key, assignments in self.definitions.assigned.items():
             field = key.rpartition(".")[2]
@@ -130,7 +134,7 @@ class LeftOvers:
                 if read_key(one.node) != key:
                     continue
                 values = [_read_first(call, one.number) for call in (before, noted)]
-                if None not in values and not np.array_equal(*values):
+                if all(value is not None for value in values) and not np.array_equal(*values):
                     text = self.source.expressions[branch.tests[0][0]].text
                     what = f"no reset sets {key} back: after an episode in which {text} was made"
                     what += f" {branch.tests[0][1]}, {one.text} begins the next one as {_show(values[1])} instead of"

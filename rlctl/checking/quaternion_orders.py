@@ -153,7 +153,9 @@ class QuaternionOrders:
 
 def _read_letter(node: ast.expr) -> str:
     name = read_name(node).lower().lstrip("_")
-    return name.removeprefix("q").removeprefix("_")[:1] if name in {p + a for p in ("", "q", "q_") for a in "wxyz"} else ""
+    return (
+        name.removeprefix("q").removeprefix("_")[:1] if name in {p + a for p in ("", "q", "q_") for a in "wxyz"} else ""
+    )
 
 
 def _read_place(node: ast.Subscript) -> int | None:
