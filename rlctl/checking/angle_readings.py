@@ -17,6 +17,7 @@ from rlctl.checking.angle_units import (
     are_mixed,
     list_factors,
     read_comment,
+    read_turn,
     read_words,
     unite,
 )
@@ -108,7 +109,7 @@ class AngleReadings:
                     return dataclasses.replace(known, is_weighted=True) if known else None
                 return unite(parts)
             case ast.BinOp(op=ast.Mod(), left=left, right=right):
-                known, turn = self._read(place.at(left)), _read_turn(right)
+                known, turn = self._read(place.at(left)), read_turn(right)
                 self._compare(node, known, turn)
                 return turn or known
             case ast.Compare(left=left, comparators=[right]):
@@ -119,8 +120,8 @@ class AngleReadings:
             case ast.IfExp(body=one, orelse=other):
                 return unite(self._read_all(place, [one, other]))
             case ast.List(elts=parts) | ast.Tuple(elts=parts):
-                found = self._read_all(place, parts)
-                return None if None in found else unite(found)
+                several = self._read_all(place, parts)
+                return None if None in several else unite(several)
             case ast.Attribute(attr="pi"):
                 return Angle(Unit.RADIANS, "pi")
             case ast.Call():
@@ -209,15 +210,14 @@ class AngleReadings:
         returned = self.definitions.list_returned(place)
         if returned:
             return unite([self._read(one) for one in returned])
-        given = call.args[1:2] if name == "full" else list(call.args)
+        parts = call.args[1:2] if name == "full" else list(call.args)
         if isinstance(call.func, ast.Attribute) and read_root(call.func) not in ("np", "numpy", "math", "p"):
-            given = [call.func.value, *given] if name in KEEPING - {"normal", "uniform", "choice"} else given
-        if name in KEEPING | {"full"} and given:
-            parts = self._read_all(place, given)
-            if name in COMPARING:
-                for part in parts[1:]:
-                    self._compare(call, parts[0], part)
-            return unite(parts) or (NUMBER if name in NUMBERS else None)
+            parts = [call.func.value, *parts] if name in KEEPING - {"normal", "uniform", "choice"} else parts
+        if name in KEEPING | {"full"} and parts:
+            units = self._read_all(place, parts)
+            for unit in units[1:] if name in COMPARING else ():
+                self._compare(call, units[0], unit)
+            return unite(units) or (NUMBER if name in NUMBERS else None)
         return NUMBER if name in NUMBERS else read_words(name)
 
     def _take_radians(self, place: ReadExpression, call: ast.Call, which: int) -> None:
@@ -266,8 +266,9 @@ class AngleReadings:
         """What modules and classes set outside their functions, by its name."""
         found: dict[str, list[tuple[ast.expr, int | None]]] = {}
         for tree in self.source.trees.values():
-            for owner in [tree, *(node for node in ast.walk(tree) if isinstance(node, ast.ClassDef))]:
-                for statement in owner.body:
+            classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+            for body in [tree.body, *(owner.body for owner in classes)]:
+                for statement in body:
                     match statement:
                         case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)):
                             for element, (target, value) in enumerate(zip(targets, values, strict=False)):
@@ -290,16 +291,6 @@ class AngleReadings:
         file, _ = self.source.find_place(statement)
         _, sign, comment = self._lines[file][(statement.end_lineno or 1) - 1].partition("  # ")
         return read_comment(comment, element) if sign else None
-
-
-def _read_turn(node: ast.expr) -> Angle | None:
-    """Return the unit in which a number is a half or a whole turn."""
-    factors = list_factors(node)
-    if factors.others or factors.conversions:
-        return None
-    if factors.pi == 1 and factors.number in (1.0, 2.0):
-        return Angle(Unit.RADIANS, "of turns of 2 pi")
-    return Angle(Unit.DEGREES, "of turns of 360") if not factors.pi and factors.number in (180.0, 360.0) else None
 
 
 def _is_in_degrees(call: ast.Call) -> bool:

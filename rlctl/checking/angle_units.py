@@ -148,3 +148,13 @@ def unite(parts: Sequence[Angle | None]) -> Angle | None:
 def are_mixed(one: Angle | None, other: Angle | None) -> bool:
     """Say whether one is in degrees and the other in radians."""
     return one is not None and other is not None and {one.unit, other.unit} == {Unit.DEGREES, Unit.RADIANS}
+
+
+def read_turn(node: ast.expr) -> Angle | None:
+    """Return the unit in which a number is a half or a whole turn."""
+    factors = list_factors(node)
+    if factors.others or factors.conversions:
+        return None
+    if factors.pi == 1 and factors.number in (1.0, 2.0):
+        return Angle(Unit.RADIANS, "of turns of 2 pi")
+    return Angle(Unit.DEGREES, "of turns of 360") if not factors.pi and factors.number in (180.0, 360.0) else None

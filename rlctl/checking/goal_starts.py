@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -91,10 +92,7 @@ class GoalStarts:
         if goal is None or not all(_equal(one, other) for one, other in zip(values, goal, strict=True)):
             return False
         later = [value for call in self.noted.episodes[0][1:] for value in call.values.get(state.number, ())]
-        return any(
-            value is not None and np.shape(value) == np.shape(values[0]) and np.max(np.abs(value - values[0])) > MOVED
-            for value in later
-        )
+        return any(value is not None and not _equal(value, values[0], MOVED) for value in later)
 
     def find_vain_draws(self) -> Iterator[GoalFault]:
         """Yield goals that resets draw and that are then replaced, or never used, or that have no choice."""
@@ -105,7 +103,7 @@ class GoalStarts:
                 first = several[0]
                 if self._is_unused(first, function):
                     yield self._make(first.statement, "it is drawn, and nothing reads it")
-                for one, other in zip(several, several[1:], strict=False):
+                for one, other in itertools.pairwise(several):
                     if is_goal(read_key(one.target)) and self._replaces(one, other, text, function):
                         what = f"it is drawn, and replaced at once by {write_code(other.value)}"
                         yield self._make(one.statement, what)
@@ -149,6 +147,7 @@ class GoalStarts:
         """Say whether a draw is replaced, in the same lines, by what has nothing to do with it."""
         parents = self.source.parents
         is_plain = parents[one.statement] is parents[other.statement] and one.statement is not other.statement
+        is_plain &= not isinstance(other.statement, ast.AugAssign)
         if not is_plain or not self._draws(one.value) or one.added or other.added or one.element is not None:
             return False
         first, last = one.statement.end_lineno or 0, other.statement.end_lineno or 0
@@ -175,7 +174,7 @@ def _read_last(call: NotedCall, number: int) -> Value:
     return values[-1] if values else None
 
 
-def _equal(one: Value, other: Value) -> bool:
+def _equal(one: Value, other: Value, tolerance: float = SAME) -> bool:
     if one is None or other is None or np.size(one) != np.size(other):
         return False
-    return bool(np.allclose(np.ravel(one), np.ravel(other), rtol=SAME, atol=SAME))
+    return bool(np.allclose(np.ravel(one), np.ravel(other), rtol=tolerance, atol=tolerance))

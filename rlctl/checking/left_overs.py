@@ -1,4 +1,4 @@
-"""What the steps of an episode leave to the next one: constraints and bodies of PyBullet, forces and switches of MuJoCo,
+"""What the steps of an episode leave to the next: constraints and bodies of PyBullet, forces and switches of MuJoCo,
 and attributes that are set under conditions which episodes of a check hardly ever meet."""
 
 import ast
@@ -77,12 +77,12 @@ class LeftOvers:
             if function in self._resets or function.name in RESETS:
                 continue
             for node in ast.walk(function):
-                if isinstance(node, ast.Call) and (removing := REMOVED.get(read_name(node.func))):
-                    if not removing & called:
-                        removal = min(removing - {"resetSimulation", "disconnect"})
-                        what = f"{read_name(node.func)} in a step, and no reset calls {removal}: what an episode has"
-                        what += " made is still there in the next one"
-                        yield LeftOver(node, what, self.source.find_place(node))
+                removing = REMOVED.get(read_name(node.func)) if isinstance(node, ast.Call) else None
+                if isinstance(node, ast.Call) and removing and not removing & called:
+                    removal = min(removing - {"resetSimulation", "disconnect"})
+                    what = f"{read_name(node.func)} in a step, and no reset calls {removal}: what an episode has"
+                    what += " made is still there in the next one"
+                    yield LeftOver(node, what, self.source.find_place(node))
 
     def find_fields(self) -> Iterator[LeftOver]:
         """Yield fields of MuJoCo's data that steps set under a condition, and resets never."""
@@ -99,7 +99,7 @@ class LeftOvers:
             is_reset = any(one.function in self._resets for one in assignments)
             is_always = any(not self.definitions.list_conditions(one.statement) for one in several)
             if field in FIELDS and several and not is_reset and not is_always:
-                what = f"{write_code(several[0].statement)} in a step, and no reset sets {field} back or calls mj_resetData"
+                what = f"{write_code(several[0].statement)} in a step, and no reset sets it back or calls mj_resetData"
                 yield LeftOver(several[0].statement, what, self.source.find_place(several[0].statement))
 
     def find_attributes(self) -> Iterator[LeftOver]:
@@ -133,12 +133,12 @@ class LeftOvers:
             for one in self.source.expressions:
                 if read_key(one.node) != key:
                     continue
-                values = [_read_first(call, one.number) for call in (before, noted)]
-                if all(value is not None for value in values) and not np.array_equal(*values):
+                first, value = _read_first(before, one.number), _read_first(noted, one.number)
+                if first is not None and value is not None and not np.array_equal(first, value):
                     text = self.source.expressions[branch.tests[0][0]].text
                     what = f"no reset sets {key} back: after an episode in which {text} was made"
-                    what += f" {branch.tests[0][1]}, {one.text} begins the next one as {_show(values[1])} instead of"
-                    what += f" {_show(values[0])}"
+                    what += f" {branch.tests[0][1]}, {one.text} begins the next one as {_show(value)} instead of"
+                    what += f" {_show(first)}"
                     return LeftOver(assignment.statement, what, self.source.find_place(assignment.statement))
         return None
 

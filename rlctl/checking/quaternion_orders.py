@@ -18,6 +18,7 @@ SOURCES: Mapping[str, str] = {
 }
 """Attributes and functions of libraries whose order is known."""
 PAIRS = {"getBasePositionAndOrientation", "multiplyTransforms", "invertTransform"}  # a position, and a quaternion
+TURN_FIELDS = {("getBasePositionAndOrientation", 1), *(("getLinkState", field) for field in (1, 3, 5))}
 TAKING: Mapping[str, tuple[str, tuple[int, ...]]] = {
     "from_quat": (XYZW, (0,)),
     "getMatrixFromQuaternion": (XYZW, (0,)),
@@ -126,10 +127,7 @@ class QuaternionOrders:
             return WXYZ
         field = self._fields.find_field(node) if isinstance(node, ast.Subscript) else None
         if field is not None:
-            is_turn = field.field in {"getLinkState": (1, 3, 5), "getBasePositionAndOrientation": (1,)}.get(
-                field.function, ()
-            )
-            return XYZW if is_turn else None
+            return XYZW if (field.function, field.field) in TURN_FIELDS else None
         found = {self.find(one, depth + 1) for one in self.definitions.follow(place)} or {
             self._find_unpacked(node, place.function)
         }

@@ -1,5 +1,5 @@
-"""Boats with angles in degrees and radians, next to twins that convert them rightly. They are written in different ways:
-attributes, constants with a comment, dictionaries, helper functions, rotations of SciPy, gains."""
+"""Boats with angles in degrees and radians, next to twins that convert them rightly. They are written in different
+ways: attributes, constants with a comment, dictionaries, helper functions, rotations of SciPy, gains."""
 
 import math
 

@@ -1,10 +1,11 @@
 """RL126, RL132: degrees and radians, as the source shows them."""
 
+import ast
+
 import pytest
 
 from rlctl.checking.angle_units import Unit, list_factors, read_comment, read_words
 from tests.checking.judging import case, check_case, found_in_source, mark_slow
-import ast
 
 FILE = "broken_angles.py"
 PAIRS = {
@@ -35,7 +36,7 @@ def test_reads_the_source(name):
 
 
 @pytest.mark.parametrize(
-    "text, conversions",
+    ("text", "conversions"),
     [
         ("x * 180 / np.pi", [Unit.TO_DEGREES]),
         ("x / (180 / math.pi)", [Unit.TO_RADIANS]),
@@ -50,7 +51,7 @@ def test_what_converts_is_a_factor(text, conversions):
 
 
 @pytest.mark.parametrize(
-    "name, unit",
+    ("name", "unit"),
     [
         ("MAX_TILT_DEG", Unit.DEGREES),
         ("yaw_rad", Unit.RADIANS),

@@ -19,8 +19,8 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Many episodes succeed at their first step with the zero action, and are one in the end. The success rate
-        then means little, and if success ends an episode, most of the training is wasted. Or the goal that reset sets is, in
-        each episode, the very place or direction in which the robot starts.
+        then means little, and if success ends an episode, most of the training is wasted. Or the goal that reset
+        sets is, in each episode, the very place or direction in which the robot starts.
     """,
     fix="""
         Draw start and goal again until they are apart, and compute success from the state of this episode, not
