@@ -65,13 +65,13 @@ class GoalStarts:
 
     def _read_goal(self, key: str) -> list[Value] | None:
         """Return the value of a goal at the end of each reset; None unless it is another one in each."""
-        for one in self.source.expressions:
-            if read_key(one.node) != key or not isinstance(one.node, ast.Attribute):
-                continue
-            values = [_read_last(call, one.number) for call in self.resets]
-            if all(value is not None for value in values) and all(not _equal(values[0], other) for other in values[1:]):
-                return values
-        return None
+        several = [one for one in self.source.expressions if read_key(one.node) == key]
+        numbers = {one.number for one in several if isinstance(one.node, ast.Attribute)}
+        values = [
+            next((value for number, value in reversed(call.events) if number in numbers), None) for call in self.resets
+        ]
+        is_known = all(value is not None for value in values)
+        return values if is_known and all(not _equal(values[0], other) for other in values[1:]) else None
 
     def _list_compared(self, key: str) -> Iterator[Expression]:
         """Yield what is subtracted from a goal, or the other way round, and what that is computed from."""

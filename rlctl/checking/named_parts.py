@@ -24,7 +24,7 @@ SIDES = {
 OPPOSITES = ((LEFT, RIGHT), (FRONT, REAR))
 PARTS = {
     "ankle", "calf", "elbow", "finger", "foot", "gripper", "hand", "handle", "head", "hip", "knee", "shin", "shoulder",
-    "tail", "thigh", "thumb", "torso", "trunk", "wheel", "wrist",
+    "sole", "tail", "thigh", "thumb", "torso", "trunk", "wheel", "wrist",
 }  # fmt: skip
 PLURALS = {"feet": "foot", "calves": "calf", "thighs": "thigh", **{f"{part}s": part for part in PARTS}}
 RELATED = {"parent", "parents", "opposite", "other", "mirror", "mirrored", "partner", "attach", "attached", "to", "and"}
@@ -92,6 +92,12 @@ class NamedParts:
                     pass
                 case ast.Subscript() if above.slice is below or above.value is below:
                     pass
+                case ast.Tuple(elts=parts) if below in parts:
+                    assign = self._source.parents[above]
+                    targets = assign.targets if isinstance(assign, ast.Assign) else []
+                    several = [one.elts for one in targets if isinstance(one, ast.Tuple | ast.List)]
+                    place = parts.index(below)  # type: ignore[arg-type]
+                    return [read_name(one[place]) for one in several if len(one) == len(parts)]
                 case ast.Assign(targets=targets):
                     return [name for target in targets if (name := read_name(target))]
                 case ast.AnnAssign(target=target):
