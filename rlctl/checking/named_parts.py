@@ -96,7 +96,7 @@ class NamedParts:
                     assign = self._source.parents[above]
                     targets = assign.targets if isinstance(assign, ast.Assign) else []
                     several = [one.elts for one in targets if isinstance(one, ast.Tuple | ast.List)]
-                    place = parts.index(below)  # type: ignore[arg-type]
+                    place = parts.index(below)
                     return [read_name(one[place]) for one in several if len(one) == len(parts)]
                 case ast.Assign(targets=targets):
                     return [name for target in targets if (name := read_name(target))]

@@ -86,11 +86,11 @@ class QuaternionOrders:
                     if place < len(args):
                         yield args[place], WXYZ if _is_scalar_first(node) else order, write_code(node)
             case ast.BinOp(left=left, op=ast.Add(), right=right):
-                owner, places = _read_products(left, right)
-                orders = FORMULAS.get(places)
+                multiplied, pairs = _read_products(left, right)
+                orders = FORMULAS.get(pairs)
                 words = self._list_names(node, function)
-                if owner is not None and orders and bool(words & YAW_WORDS) != bool(words & ROLL_WORDS):
-                    yield owner, orders[0 if words & YAW_WORDS else 1], write_code(node)
+                if multiplied is not None and orders and bool(words & YAW_WORDS) != bool(words & ROLL_WORDS):
+                    yield multiplied, orders[0 if words & YAW_WORDS else 1], write_code(node)
             case ast.Subscript() | ast.List() | ast.Call():
                 if (turned := _read_turned(node)) is not None:
                     yield turned[0], turned[1][0], write_code(node)
