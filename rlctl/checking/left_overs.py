@@ -25,8 +25,8 @@ FIELDS = {"xfrc_applied", "qfrc_applied", "eq_active", "mocap_pos", "mocap_quat"
 DATA_RESETS = {"mj_resetData", "mj_resetDataKeyframe", "mj_setState", "mj_copyData", "MjData"}
 LASTING_WORDS = {
     "all", "best", "buffer", "cache", "cached", "curriculum", "difficulty", "episode", "episodes", "ever", "frames",
-    "history", "level", "lifetime", "log", "max", "record", "rate", "render", "renderer", "score", "stats", "success",
-    "successes", "total", "viewer", "window", "wins",
+    "history", "level", "lifetime", "log", "max", "record", "rate", "render", "renderer", "running", "score", "stats",
+    "success", "successes", "total", "viewer", "window", "wins",
 }  # fmt: skip
 """What is meant to last longer than an episode."""
 FORCED_FROM, FORCED_STEPS = 2, 5

@@ -3,7 +3,7 @@
 import ast
 import functools
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from rlctl.checking.assignments import read_name
 from rlctl.checking.bullet_worlds import read_world
@@ -31,6 +31,7 @@ RELATED = {"parent", "parents", "opposite", "other", "mirror", "mirrored", "part
 """Words of a name that tells of a relation between parts, or of several."""
 NUMBER_WORDS = {"link", "joint", "index", "idx", "id"}
 MOST_TRANSPARENT = 8
+COUNTS = {"body": "nbody", "geom": "ngeom", "site": "nsite", "joint": "njnt", "actuator": "nu", "sensor": "nsensor"}
 
 
 def find_named_otherwise(rule: Rule, noted: NotedEpisodes) -> Iterator[RuleFinding]:
@@ -49,7 +50,7 @@ def find_named_otherwise(rule: Rule, noted: NotedEpisodes) -> Iterator[RuleFindi
         for node in ast.walk(top):
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in named.known:
                 for name in named.list_names(node):
-                    if (what := named.find_contradiction(name, node.value)) is not None:
+                    if (what := named.find_contradiction(name, node.value, noted.source.parents[node])) is not None:
                         message = f"{name} is the part {node.value!r}, which is another one: {what}"
                         place = noted.source.find_place(node)
                         yield RuleFinding(rule, message, {"element": name, "value": node.value}, where=place)
@@ -74,12 +75,30 @@ class NamedParts:
         return [body for client in self._instance.find_clients() for body in read_world(client).bodies]
 
     @functools.cached_property
-    def known(self) -> Collection[str]:
-        """The names that the engine knows: those of links, joints, geoms and others."""
-        found = {name for body in self._bodies for name in [*body.links, *(joint.name for joint in body.joints)]}
+    def _kinds(self) -> Mapping[str, set[str]]:
+        """The names that the engine knows, by their kinds."""
+        found: dict[str, set[str]] = {
+            "link": {name for body in self._bodies for name in body.links},
+            "joint": {joint.name for body in self._bodies for joint in body.joints},
+        }
         if (simulation := find_mujoco(self._instance.env)) is not None:
-            found |= {name.decode(errors="replace") for name in simulation[0].names.split(b"\0")}
-        return found - {""}
+            model = simulation[0]
+            for kind, count in COUNTS.items():
+                named = {getattr(model, kind)(number).name for number in range(getattr(model, count))}
+                found[kind] = found.get(kind, set()) | named
+        return {kind: names - {""} for kind, names in found.items()}
+
+    @functools.cached_property
+    def known(self) -> Collection[str]:
+        """All of these."""
+        return set[str]().union(*self._kinds.values())
+
+    def _list_alike(self, part: str, lookup: ast.AST | None) -> set[str]:
+        """Return the names of the kind that is looked up; where that is not known, of the kinds that have the part."""
+        text = ast.unparse(lookup).lower() if isinstance(lookup, ast.Call) else ""
+        kinds = [kind for kind in self._kinds if f".{kind}(" in text or f"mjobj_{kind}," in text]
+        kinds = kinds or [kind for kind, names in self._kinds.items() if part in names]
+        return set[str]().union(*(self._kinds[kind] for kind in kinds))
 
     def list_names(self, node: ast.expr) -> list[str]:
         """Return what a part is called that is looked up by its name: where it is kept, or the key of an entry."""
@@ -104,13 +123,19 @@ class NamedParts:
                     return [name for name in [read_name(target)] if name]
                 case ast.Dict(keys=keys, values=values) if below in values:
                     key = keys[values.index(below)]
-                    return [str(key.value)] if isinstance(key, ast.Constant) else []
+                    is_mirrored = below is node and isinstance(key, ast.Constant) and self._is_mirrored(key, node)
+                    return [str(key.value)] if isinstance(key, ast.Constant) and not is_mirrored else []
                 case ast.Return():
                     return [self._source.find_function(above).name]
                 case _:
                     return []
             below, above = above, self._source.parents[above]
         return []
+
+    def _is_mirrored(self, key: ast.Constant, part: ast.expr) -> bool:
+        """Say whether an entry is a pair of a part and its counterpart."""
+        name, other = str(key.value), str(part.value) if isinstance(part, ast.Constant) else ""
+        return name in self.known or _is_like(name, other)
 
     def find_wrong_index(self, assign: ast.Assign) -> tuple[str, str, str] | None:
         """Return a name that is given the number of a link of PyBullet, that link, and what contradicts."""
@@ -119,11 +144,11 @@ class NamedParts:
             case ast.Constant(value=int(index)) if len(bodies) == 1 and {*split_name(name)} & NUMBER_WORDS:
                 several = [*bodies[0].links[index + 1 : index + 2]]
                 several += [joint.name for joint in bodies[0].joints if joint.index == index]
-                found = [what for part in several if (what := self.find_contradiction(name, part)) is not None]
+                found = [what for part in several if (what := self.find_contradiction(name, part, None)) is not None]
                 return (name, several[0], found[0]) if found and len(found) == len(several) else None
         return None
 
-    def find_contradiction(self, name: str, part: str) -> str | None:
+    def find_contradiction(self, name: str, part: str, lookup: ast.AST | None) -> str | None:
         """Say what contradicts; None where nothing does. Another part has to bear the name."""
         words = [PLURALS.get(word, word) for word in split_name(name)]
         theirs = [PLURALS.get(word, word) for word in split_name(part)]
@@ -136,7 +161,7 @@ class NamedParts:
         parts, other_parts = PARTS & {*words}, PARTS & {*theirs}
         if len(parts) == 1 and other_parts and not parts & other_parts:
             wanted = min(parts)
-            others = [known for known in sorted(self.known) if wanted in split_name(known)]
+            others = [known for known in sorted(self._list_alike(part, lookup)) if wanted in split_name(known)]
             if others:
                 return f"there is {others[0]!r}"
         return None

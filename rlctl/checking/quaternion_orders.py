@@ -3,7 +3,7 @@
 import ast
 from collections.abc import Iterator, Mapping, Sequence
 
-from rlctl.checking.assignments import list_assignments, read_converted, read_name
+from rlctl.checking.assignments import list_assignments, read_converted, read_key, read_name
 from rlctl.checking.bullet_fields import BulletFields
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
@@ -136,7 +136,8 @@ class QuaternionOrders:
             return order
         if isinstance(node, ast.Subscript) and not isinstance(node.slice, ast.Slice):
             return self.find(place.at(node.value), depth + 1)
-        if isinstance(node, ast.Attribute | ast.Call) and name in SOURCES and name not in self.definitions.functions:
+        is_own = name in self.definitions.functions or read_key(node) in self.definitions.assigned
+        if isinstance(node, ast.Attribute | ast.Call) and name in SOURCES and not is_own:
             return SOURCES[name]
         words = "".join(split_name(name))
         return next((order for order, letters in ((WXYZ, "wxyz"), (XYZW, "xyzw")) if words.endswith(letters)), None)
