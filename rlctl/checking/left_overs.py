@@ -22,6 +22,7 @@ REMOVED = {
 """What PyBullet keeps until it is removed, and what removes it; restoreState does not."""
 FIELDS = {"xfrc_applied", "qfrc_applied", "eq_active", "mocap_pos", "mocap_quat"}
 """Fields of MuJoCo's data that stay as they are."""
+STATE_FIELDS = FIELDS | {"ctrl", "qpos", "qvel", "act", "qacc_warmstart", "time"}
 DATA_RESETS = {"mj_resetData", "mj_resetDataKeyframe", "mj_setState", "mj_copyData", "MjData"}
 LASTING_WORDS = {
     "all", "best", "buffer", "cache", "cached", "curriculum", "difficulty", "episode", "episodes", "ever", "frames",
@@ -109,15 +110,29 @@ class LeftOvers:
             of_steps = [one for one in assignments if one.function in self._steps]
             is_reset = any(one.function in self._resets for one in assignments)
             words = {*read_words(key)}
-            if is_reset or not of_steps or words & LASTING_WORDS or self._is_never_read(key):
+            is_meant = words & LASTING_WORDS or key.rpartition(".")[2] in STATE_FIELDS
+            if is_reset or not of_steps or is_meant or self._is_never_read(key):
                 continue
             for one in of_steps:
                 for tests in list(self._draws.list_tests(one))[:1] if tried < MOST_TRIED else ():
+                    if self._is_always_met(tests):
+                        continue
                     tried += 1
                     found = self._try(key, one, Branch(key, tests))
                     if found is not None:
                         yield found
                         return
+
+    def _is_always_met(self, tests: Sequence[tuple[int, bool]]) -> bool:
+        """Say whether a condition held in each step that was played: what it sets was left over there already."""
+        values = [
+            np.all(value) == is_met
+            for call in self.noted.steps
+            for number, is_met in tests
+            for value in call.values.get(number, ())
+            if value is not None
+        ]
+        return all(values)
 
     def _is_never_read(self, key: str) -> bool:
         reads = [one for one in self.source.expressions if read_key(one.node) == key and one.function in self._steps]
