@@ -91,6 +91,14 @@ class NotedEpisodes:
         """All functions of the source that were run."""
         return list(self._list_run([call for episode in self.episodes for call in episode]))
 
+    @functools.cached_property
+    def own_functions(self) -> list[Function]:
+        """Those, and all methods of the environment's own classes: what builds it was not noted."""
+        trees = self.source.trees.values()
+        classes = [one for tree in trees for one in ast.walk(tree) if isinstance(one, ast.ClassDef)]
+        own = [one for owner in classes if owner.name in self.source.classes for one in owner.body]
+        return list(dict.fromkeys([*self.functions, *(one for one in own if isinstance(one, Function))]))
+
     def _list_run(self, calls: Sequence[NotedCall]) -> dict[Function, None]:
         return dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)
 
