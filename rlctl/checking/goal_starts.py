@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import itertools
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,8 +15,15 @@ from rlctl.checking.goal_draws import DRAWS
 from rlctl.checking.previous_values import is_goal
 from rlctl.checking.source_code import Expression, Function, walk_own, write_code
 from rlctl.checking.stale_values import FIRST_WORDS
+from rlctl.checking.term_names import split_name
+from rlctl.checking.values import list_own_classes
 
 AIM_WORDS = {"aim", "desired"}
+STAYING_WORDS = {
+    "balance", "balances", "balancing", "hold", "holds", "holding", "home", "hover", "hovers", "hovering", "keep",
+    "keeps", "keeping", "stabilize", "stabilizes", "stabilization", "stand", "stands", "station", "stay", "stays",
+}  # fmt: skip
+"""What an environment says of itself whose goal is to stay where it starts."""
 SAME = 1e-5
 MOVED = 1e-3
 FEWEST_EPISODES = 3
@@ -52,7 +60,7 @@ class GoalStarts:
 
     def find_at_start(self) -> Iterator[GoalFault]:
         """Yield goals that are, at each start, what they are compared with."""
-        if len(self.noted.episodes) < FEWEST_EPISODES:
+        if len(self.noted.episodes) < FEWEST_EPISODES or self._is_to_stay():
             return
         for key, assignments in self._list_goals():
             goal = self._read_goal(key)
@@ -62,6 +70,12 @@ class GoalStarts:
                     what += " goal is always where the robot starts"
                     yield self._make(assignments[-1].statement, what)
                     break
+
+    def _is_to_stay(self) -> bool:
+        said = [word for tree in self.source.trees.values() for word in re.split(r"\W+", ast.get_docstring(tree) or "")]
+        for cls in list_own_classes(self.source.author):
+            said += [*split_name(cls.__name__), *re.split(r"\W+", cls.__doc__ or "")]
+        return bool({word.lower() for word in said} & STAYING_WORDS)
 
     def _read_goal(self, key: str) -> list[Value] | None:
         """Return the value of a goal at the end of each reset; None unless it is another one in each."""
