@@ -106,10 +106,12 @@ class UnwrappedAngles:
         if not steps:
             return False
         _, number, step, value = max(steps, key=lambda found: found[0])
-        return value is not None and self._pays_otherwise(number, step, {one.number: _turn_back(value)})
+        return value is not None and self._pays_otherwise(
+            number, step, [{one.number: v} for v in (value, _turn_back(value))]
+        )
 
-    def _pays_otherwise(self, number: int, step: int, forced: Mapping[int, Value]) -> bool:
-        played = [self.notes.play(number, step, {step: values}) for values in ({}, forced)]
+    def _pays_otherwise(self, number: int, step: int, forced: Sequence[Mapping[int, Number]]) -> bool:
+        played = [self.notes.play(number, step, {step: values}) for values in forced]
         if any(len(calls) <= step for calls in played):
             return False
         rewards = [calls[step][1].reward_number for calls in played]
