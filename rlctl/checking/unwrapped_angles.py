@@ -2,7 +2,7 @@
 
 import ast
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -19,7 +19,6 @@ WRAPPED = {"arctan2", "atan2", "remainder", "angle"}
 NEAR_JUMP = 2.0  # of an angle that is wrapped, and jumps at pi [rad]
 FEWEST_CALLS = 10  # in which a side of a difference is what a sine is of
 SAME = 1e-9
-CHANGED = 1e-6  # part of the reward that a turn changes, at least
 
 
 class UnwrappedAngles:
@@ -106,16 +105,10 @@ class UnwrappedAngles:
         if not steps:
             return False
         _, number, step, value = max(steps, key=lambda found: found[0])
-        return value is not None and self._pays_otherwise(
-            number, step, [{one.number: v} for v in (value, _turn_back(value))]
-        )
-
-    def _pays_otherwise(self, number: int, step: int, forced: Sequence[Mapping[int, Number]]) -> bool:
-        played = [self.notes.play(number, step, {step: values}) for values in forced]
-        if any(len(calls) <= step for calls in played):
+        if value is None:
             return False
-        rewards = [calls[step][1].reward_number for calls in played]
-        return bool(np.isfinite(rewards).all()) and abs(rewards[1] - rewards[0]) > CHANGED * max(1.0, abs(rewards[0]))
+        same, turned = ({one.number: given} for given in (value, _turn_back(value)))
+        return bool(self.notes.changes_reward(number, step, same, turned))
 
 
 def _list_values(one: Expression, calls: Sequence[NotedCall]) -> list[Value]:

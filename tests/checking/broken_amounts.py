@@ -264,6 +264,19 @@ class PuckBacksUp(Puck):
         return -self.state["speed"][0]
 
 
+class PuckIsAsFast(Puck):
+    def pay(self, action):
+        return -abs(np.linalg.norm(self.state["speed"]) - abs(self.cmd[0])) - 0.1 * self.gap()
+
+
+class PuckIsAsFastThatWay(PuckIsAsFast):
+    def pay(self, action):
+        return super().pay(action) + 0.2 * self.way() * self.state["speed"][0]
+
+    def way(self):
+        return np.sign(self.cmd[0])
+
+
 class PuckFollows(Puck):
     def pay(self, action):
         errors = {"ahead": self.ahead() - self.cmd[0], "turn": self.state["turning"] - self.cmd[1]}

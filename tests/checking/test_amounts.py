@@ -54,6 +54,10 @@ def find_one_sided(notes):
     return list(SizeReader(notes).find_one_sided())
 
 
+def find_sizes_only(notes):
+    return list(SizeReader(notes).find_sizes_only())
+
+
 def find_always_met(notes):
     return list(SizeReader(notes).find_always_met())
 
@@ -72,6 +76,7 @@ def find_always_met(notes):
         ("PuckTurnsLeft", "PuckIsStraight", find_signed),
         ("PuckWearsOneSide", "PuckWearsBothSides", find_signed),
         ("RL633PuckOnlySpeeds", "PuckFollows", find_one_sided),
+        ("PuckIsAsFast", "PuckIsAsFastThatWay", find_sizes_only),
         ("PuckTurnsEitherWay", "PuckTurnsAsTold", find_one_sided),
         ("RL632PuckIsAlwaysRight", "PuckIsTolerant", find_always_met),
         ("PuckHasWideKernels", "PuckHasKernels", find_always_met),

@@ -5,6 +5,7 @@ import ast
 import contextlib
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -27,6 +28,7 @@ EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
 LONGEST_S = 10.0  # for episodes that are played again [s]
+CHANGED = 1e-6  # part of a reward by which another one differs
 MOST_NOTED = 300_000  # values; no episode begins after so many
 
 
@@ -63,6 +65,14 @@ class NotedEpisodes:
             self.recorder.forced = {}
             self._times.append(read_clock() - began)
         return played
+
+    def changes_reward(self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any]) -> bool | None:
+        """Say whether a step of an episode pays otherwise where expressions are worth what `other` has, instead of what
+        `one` has; None where it cannot be played."""
+        played = [self.play(number, step, {step: values}) for values in (one, other)]
+        rewards = [calls[step][1].reward_number if len(calls) > step else math.nan for calls in played]
+        is_known = all(map(math.isfinite, rewards))
+        return not math.isclose(*rewards, rel_tol=CHANGED, abs_tol=CHANGED) if is_known else None
 
     def share(self, reader: Callable[["NotedEpisodes"], Reader]) -> Reader:
         """Return what a class reads of the episodes, which is made once for all judges."""

@@ -120,6 +120,11 @@ def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message += f" which is never negative: {ast.unparse(one.place.node)}"
         yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
         return
+    for one in notes.share(SizeReader).find_sizes_only():
+        message = f"reward term {one.summand.name!r} compares two sizes, {ast.unparse(one.place.node)}: the opposite"
+        message += " command pays the same"
+        yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
+        return
     for length in notes.share(LengthReader).find():
         message = f"reward term {length.summand.name!r} has {ast.unparse(length.place.node)}, called {length.called!r}:"
         message += " it is a length, so motion in any direction is paid as the one that is meant"
