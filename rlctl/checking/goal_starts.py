@@ -72,7 +72,10 @@ class GoalStarts:
                     break
 
     def _is_to_stay(self) -> bool:
-        said = [word for tree in self.source.trees.values() for word in re.split(r"\W+", ast.get_docstring(tree) or "")]
+        said: list[str] = []
+        for tree in self.source.trees.values():
+            if sum(isinstance(node, ast.ClassDef) for node in tree.body) == 1:  # it is about this one
+                said += re.split(r"\W+", ast.get_docstring(tree) or "")
         for cls in list_own_classes(self.source.author):
             said += [*split_name(cls.__name__), *re.split(r"\W+", cls.__doc__ or "")]
         return bool({word.lower() for word in said} & STAYING_WORDS)
