@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 TRIED, STEPS = range(5, 13), 10  # more episodes, for links and for goals, and steps of each
 RIGID = 1e-5  # by which the distance of a place and its link may change [m]
 LONGEST_OFFSET = 0.5  # between both [m]
+LATE, MOST_LATE = 0.01, 0.05  # the same of a place that is read a substep late, mostly and at most [m]
 FALLS = 0.3  # correlation of a summand with a distance
 FEWEST = 10  # steps in which both places are known
 LAG = 0.15  # part of a clipped range by which a place may be off
@@ -176,6 +177,8 @@ class BoundReader:
         moves = np.ptp([links for _, links in known], axis=0).max(axis=1) > LEAST_MOTION
         if known[0][0].size < 3:
             is_rigid &= offsets.max(axis=0) < RIGID
+        # MuJoCo's places are those before the last substep.
+        is_rigid |= (np.median(offsets, axis=0) < LATE) & (offsets.max(axis=0) < MOST_LATE)
         return {int(link): float(offsets[:, link].max()) for link in np.flatnonzero(is_rigid & moves)}, len(known)
 
     def _measure(self, number: int, link: int) -> tuple[Array, Array]:
@@ -199,7 +202,9 @@ class BoundReader:
             if ends is None or not isinstance(one.node, ast.Call):
                 continue
             before, after = (self._read(part) for part in (self.notes.source.find(one.node.args[0]), one))
-            if before is None or after is None or sum(map(len, after)) != len(robots):
+            if before is None or after is None:
+                continue
+            if not np.concatenate(before).shape == np.concatenate(after).shape == robots.shape:
                 continue
             low, high = ends
             given, clipped, places_of_robot = np.concatenate(before)[known], np.concatenate(after)[known], robots[known]
