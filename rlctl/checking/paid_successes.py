@@ -87,7 +87,8 @@ class SuccessReader:
         """Return the flags that last, such as a grasp, for which the reward pays besides success; and what they are."""
         found: Flags = {}
         for summand in self.goals.reward.summands:
-            for test, is_true in ((summand.place.node, True), *summand.conditions) if summand.weight > 0 else ():
+            is_paid = summand.weight > 0 and not self.goals.is_of_progress(summand)
+            for test, is_true in ((summand.place.node, True), *summand.conditions) if is_paid else ():
                 flag = self.goals.resolve_flag(summand.place.at(test))
                 if self._lasts(flag) and not self.goals.is_success(test, summand.place):
                     found |= dict.fromkeys(self._list_same(flag), is_true)

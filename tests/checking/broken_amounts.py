@@ -188,6 +188,18 @@ class PuckLands(Puck):
         return observation, reward, success, truncated, {"is_success": success}
 
 
+class PuckOpens(PuckLands):
+    """It is paid for each time its hook opens."""
+
+    bonus, before_open = 5.0, 0.0
+
+    def pay(self, action):
+        is_open = float(action[2] > 0.5)
+        opening = is_open - self.before_open
+        self.before_open = is_open
+        return 1.5 * opening - 0.01 * self.gap() + self.bonus * self.lands()
+
+
 class RL605PuckLandsForLittle(PuckLands):
     bonus = 2.0
 

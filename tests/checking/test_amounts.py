@@ -98,3 +98,9 @@ def test_what_is_paid_for_a_flag_is_earned_next_to_the_goal_too():
     staying, landing = judge("RL605PuckLandsForLittle", lambda notes: SuccessReader(notes).read_incomes())
     assert 0 < staying < 1
     assert landing == pytest.approx(2 + staying, abs=1.0)
+
+
+@pytest.mark.slow
+def test_what_is_paid_for_a_change_is_not_earned_in_each_step():
+    staying, landing = judge("PuckOpens", lambda notes: SuccessReader(notes).read_incomes())
+    assert staying <= 0 < landing
