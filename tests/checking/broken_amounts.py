@@ -167,43 +167,6 @@ class RL605PuckHolds(PuckEnds):
     bonus = 1.0
 
 
-class PuckLands(Puck):
-    """Its hook is paid for, besides the success that ends its episode."""
-
-    bonus = 100.0
-
-    def pay(self, action):
-        self.hooked = action[2] > -0.5
-        reward = -1.5 * self.gap()
-        if self.hooked:
-            reward += 1.0
-        return reward + self.bonus * self.lands()
-
-    def lands(self):
-        return bool(self.gap() < 0.02)
-
-    def step(self, action):
-        observation, reward, _, truncated, _ = super().step(action)
-        success = self.lands()
-        return observation, reward, success, truncated, {"is_success": success}
-
-
-class PuckOpens(PuckLands):
-    """It is paid for each time its hook opens."""
-
-    bonus, before_open = 5.0, 0.0
-
-    def pay(self, action):
-        is_open = float(action[2] > 0.5)
-        opening = is_open - self.before_open
-        self.before_open = is_open
-        return 1.5 * opening - 0.01 * self.gap() + self.bonus * self.lands()
-
-
-class RL605PuckLandsForLittle(PuckLands):
-    bonus = 2.0
-
-
 class PuckReturns(Puck):
     bonus = 200.0
 
