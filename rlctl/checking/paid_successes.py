@@ -3,7 +3,7 @@
 import ast
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -73,22 +73,21 @@ class SuccessReader:
             return None
         success = dict.fromkeys(self._list_same(place), True)
         met = {number: value for _, one in self._list_flags() for number, value in one.items()}
-        kept = self._list_paid_flags() | met
+        kept = self._list_paid_flags() | met | dict.fromkeys(success, False)
         nearest = {number: PARTS[0] * largest for number, largest in self.distances.items()}
-        paid = self._pay(episode, last, nearest, kept | success)
+        paid = self._pay(episode, last, nearest | kept, success)
         staying = []
         for part in NEAR_PARTS:
             near = {number: part * largest for number, largest in self.distances.items()}
             if not self._succeeds(episode, last, near, place):
-                staying.append(self._pay(episode, last, near, kept | dict.fromkeys(success, False)))
+                staying.append(self._pay(episode, last, near | kept, {}))  # for a change of a flag nothing is paid then
         return (min(staying), paid) if staying and math.isfinite(paid) else None  # the least: others may pay once
 
     def _list_paid_flags(self) -> Flags:
         """Return the flags that last, such as a grasp, for which the reward pays besides success; and what they are."""
         found: Flags = {}
         for summand in self.goals.reward.summands:
-            is_paid = summand.weight > 0 and not self.goals.is_of_progress(summand)
-            for test, is_true in ((summand.place.node, True), *summand.conditions) if is_paid else ():
+            for test, is_true in ((summand.place.node, True), *summand.conditions) if summand.weight > 0 else ():
                 flag = self.goals.resolve_flag(summand.place.at(test))
                 if self._lasts(flag) and not self.goals.is_success(test, summand.place):
                     found |= dict.fromkeys(self._list_same(flag), is_true)
@@ -178,7 +177,7 @@ class SuccessReader:
         for text, one in flags:
             yield text, met | {number: not value for number, value in one.items()} | failure
 
-    def _pay(self, episode: int, last: int, near: dict[int, float], flags: Flags) -> float:
+    def _pay(self, episode: int, last: int, near: Mapping[int, float | bool], flags: Flags) -> float:
         paid = self.forced.pay(episode, last, near, LASTING, flags)[0]
         return paid if math.isfinite(paid) else -math.inf
 

@@ -180,7 +180,7 @@ class DockerOpensItsHook(Docker):
     def step(self, action):
         observation, _, _, truncated, _ = super().step(action)
         gap, known = self.gap(), self.count
-        self.count = int(action[0] > 0.2)
+        self.count = int(action[0] > 0.97)
         docked = bool(gap < 0.02)
         reward = -0.3 * gap + 1.5 * (self.count - known)
         if docked:
