@@ -92,7 +92,7 @@ class QuaternionOrders:
                 if multiplied is not None and orders and bool(words & YAW_WORDS) != bool(words & ROLL_WORDS):
                     yield multiplied, orders[0 if words & YAW_WORDS else 1], write_code(node)
             case ast.Subscript() | ast.List() | ast.Call():
-                if (turned := _read_turned(node)) is not None:
+                if (turned := read_turned(node)) is not None:
                     yield turned[0], turned[1][0], write_code(node)
 
     def _list_names(self, node: ast.AST, function: Function) -> set[str]:
@@ -109,7 +109,7 @@ class QuaternionOrders:
         inner = read_converted(node)
         if inner is not None:
             return self.find(place.at(inner), depth + 1)
-        turned = _read_turned(node)
+        turned = read_turned(node)
         if turned is not None:
             return turned[1][1]
         match node:
@@ -118,7 +118,7 @@ class QuaternionOrders:
             case ast.UnaryOp(operand=part) | ast.Attribute(value=part, attr="T"):
                 return self.find(place.at(part), depth + 1)
             case ast.List(elts=parts) | ast.Tuple(elts=parts):
-                return _read_literal(parts)
+                return read_literal(parts)
             case ast.Call(func=ast.Attribute(attr="as_quat")):
                 return WXYZ if _is_scalar_first(node) else XYZW
             case ast.Call(func=ast.Attribute(attr="array" | "asarray" | "stack"), args=[part, *_]):
@@ -202,7 +202,7 @@ def _read_products(left: ast.expr, right: ast.expr) -> tuple[ast.expr | None, fr
     return (next(iter(owners.values())), frozenset(pairs)) if is_whole else (None, frozenset())
 
 
-def _read_turned(node: ast.AST) -> tuple[ast.expr, tuple[str, str]] | None:
+def read_turned(node: ast.AST) -> tuple[ast.expr, tuple[str, str]] | None:
     """Return a quaternion whose elements are put into another order, that which it has, and that which it gets."""
     match node:
         case ast.Subscript(value=owner, slice=ast.List() | ast.Tuple() as index):
@@ -219,7 +219,7 @@ def _read_turned(node: ast.AST) -> tuple[ast.expr, tuple[str, str]] | None:
     return None
 
 
-def _read_literal(parts: Sequence[ast.expr]) -> str | None:
+def read_literal(parts: Sequence[ast.expr]) -> str | None:
     """Return the order in which a rotation by half an angle's sine and cosine is written."""
     kinds = [_read_half(part) for part in parts]
     if len(kinds) != 4 or kinds.count("cos") != 1 or "sin" not in kinds:

@@ -1,38 +1,10 @@
-"""RL126, RL132: degrees and radians, as the source shows them."""
+"""Units of angles, by factors, names and comments."""
 
 import ast
 
 import pytest
 
 from rlctl.checking.angle_units import Unit, list_factors, read_comment, read_words
-from tests.checking.judging import case, check_case, found_in_source, mark_slow
-
-FILE = "broken_angles.py"
-PAIRS = {
-    "RL132BoatUpTheRiverInRadians": "BoatUpTheRiver",
-    "RL132BoatUpTheRiverTwice": "BoatUpTheRiver",
-    "RL132BoatUpTheRiverBackwards": "BoatUpTheRiver",
-    "RL132BoatByCompassInRadians": "BoatByCompass",
-    "RL132BoatKeepsItsCoursePerDegree": "BoatKeepsItsCourse",
-    "RL126BoatLooksAsideInDegrees": "BoatLooksAside",
-}
-CASES = [
-    case(f"{FILE}:{name}", (name[:5], "warning"), twin=f"{FILE}:{twin}", slow=True) for name, twin in PAIRS.items()
-]
-
-
-@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
-def test_finds_the_mistake_and_only_that(case):
-    check_case(case)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PAIRS)
-def test_reads_the_source(name):
-    found = found_in_source(f"{FILE}:{name}")
-    assert [*found] == [name[:5]]
-    assert found[name[:5]].where[0].endswith(FILE)
-    assert not found_in_source(f"{FILE}:{PAIRS[name]}")
 
 
 @pytest.mark.parametrize(
