@@ -24,6 +24,7 @@ STAYING_WORDS = {
     "keeps", "keeping", "stabilize", "stabilizes", "stabilization", "stand", "stands", "station", "stay", "stays",
 }  # fmt: skip
 """What an environment says of itself whose goal is to stay where it starts."""
+GENERATORS = {"default_rng", "RandomState"}
 SAME = 1e-5
 MOVED = 1e-3
 FEWEST_EPISODES = 3
@@ -135,6 +136,14 @@ class GoalStarts:
                 is_later = any(number in call.values for call in self.resets[1:] for number in numbers)
                 if numbers and is_first and not is_later and len(self.resets) > 1:
                     yield self._make(one.statement, "only the first reset draws this goal, and later ones keep it")
+
+    def find_fixed_generators(self) -> Iterator[GoalFault]:
+        """Yield generators that each reset makes anew from one number: they draw the same in each episode."""
+        for function in self.noted.of_resets:
+            for node in ast.walk(function) if isinstance(function, Function) and function.name != "__init__" else ():
+                match node:
+                    case ast.Call(func=called, args=[ast.Constant(value=int(seed))]) if read_name(called) in GENERATORS:
+                        yield self._make(node, f"each reset draws what the seed {seed} gives, whatever its own seed is")
 
     def _find_draw(self, one: Assignment) -> ast.expr:
         for node in ast.walk(one.value):

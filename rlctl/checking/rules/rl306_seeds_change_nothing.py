@@ -21,7 +21,7 @@ RULE = Rule(
         All seeds give the same start and, with the same actions, the same trajectory: a policy may memorise it.
         Some tasks are fixed (a puzzle, a maze), so this is only an info. A fixed start with random steps is no
         finding. It is a warning where reset draws a goal that is then replaced or never read, or that only the first
-        reset draws.
+        reset draws, and where each reset makes a generator from one number.
     """,
     fix="""
         If the task should vary, draw the start from self.np_random in reset, after super().reset(seed=seed).
@@ -36,7 +36,8 @@ FEWEST_SEEDS = 4
 @judges_expressions(RULE, decides=False)
 def _find_vain_draws(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     starts = noted.share(GoalStarts)
-    for one in itertools.islice(itertools.chain(starts.find_vain_draws(), starts.find_first_draws()), 1):
+    found = itertools.chain(starts.find_vain_draws(), starts.find_first_draws(), starts.find_fixed_generators())
+    for one in itertools.islice(found, 1):
         evidence = {"element": write_code(one.node)}
         yield RuleFinding(RULE, one.what, evidence, Severity.WARNING, where=one.where)
 
