@@ -1,6 +1,7 @@
 """Boats that keep something of the episode before, whose buoy is where they start or is drawn in vain, that read a
 quaternion in the wrong order, and hoppers that call a part by another name; next to twins that do not."""
 
+import mujoco
 import numpy as np
 from mujoco_robots import MujocoHopper
 from robots import Boat
@@ -81,6 +82,16 @@ class RL306BoatToOneAim(BoatToItsAim):
         self.target = np.array([0.3, 0.2])
 
 
+class RL306BoatOfOneGenerator(BoatToItsAim):
+    """Only the noise of its start is another one."""
+
+    def start(self):
+        super().start()
+        generator = np.random.default_rng(7)
+        self.place = generator.uniform(-1, 1, 2) + self.np_random.normal(0, 0.01, 2)
+        self.target = self.place + generator.uniform(-0.6, 0.6, 2)
+
+
 class BoatWithAGyro(Boat):
     """It reads its heading from the quaternion of a sensor."""
 
@@ -121,3 +132,48 @@ class RL841HopperOfItsShin(HopperOfItsSoles):
     def height(self):
         sole, foot = self.data.geom("left_sole"), self.data.body("left_shin")
         return float(sole.xpos[2] + 0.0 * foot.xpos[2])
+
+
+class HopperOfForces(MujocoHopper):
+    """It pays for the force of its soles on the ground, and for its tilt."""
+
+    def up(self):
+        return self.attitude().inv().apply([0.0, 0.0, 1.0])
+
+    def tilt(self):
+        return np.sum(self.up()[:2] ** 2)
+
+    def pressure(self):
+        total, force = 0.0, np.zeros(6)
+        for number in range(self.data.ncon):
+            mujoco.mj_contactForce(self.model, self.data, number, force)
+            total += force[0]
+        return total
+
+    def reward(self):
+        return super().reward() - 0.001 * self.pressure() - 0.3 * self.tilt()
+
+
+class RL621HopperOfForcesLeans(HopperOfForces):
+    def tilt(self):
+        return np.sum(self.up()[2:] ** 2)
+
+
+class RL839HopperOfForcesSideways(HopperOfForces):
+    def pressure(self):
+        total, force = 0.0, np.zeros(6)
+        for number in range(self.data.ncon):
+            mujoco.mj_contactForce(self.model, self.data, number, force)
+            total += force[2]
+        return total
+
+
+class HopperOfFriction(HopperOfForces):
+    """It pays for the friction of its soles."""
+
+    def pressure(self):
+        total, force = 0.0, np.zeros(6)
+        for number in range(self.data.ncon):
+            mujoco.mj_contactForce(self.model, self.data, number, force)
+            total += np.hypot(force[1], force[2])
+        return total

@@ -94,6 +94,9 @@ SHOWN = {
         "RL644BoatTowsWithATautRope": ("RL644", "BoatTows"),
         "RL610BoatFloatsAtItsAim": ("RL610", "BoatToItsAim"),
         "RL306BoatToOneAim": ("RL306", "BoatToItsAim"),
+        "RL306BoatOfOneGenerator": ("RL306", "BoatToItsAim"),
+        "RL621HopperOfForcesLeans": ("RL621", "HopperOfForces"),
+        "RL839HopperOfForcesSideways": ("RL839", "HopperOfForces"),
         "RL116BoatWithAGyroReadAsWxyz": ("RL116", "BoatWithAGyro"),
         "RL841HopperOfTheOtherSole": ("RL841", "HopperOfItsSoles"),
         "RL841HopperOfItsShin": ("RL841", "HopperOfItsSoles"),
@@ -112,6 +115,7 @@ SOUND = {
     "broken_late.py": ["CrabSteersByIt", "CrabKeepsAView", "CrabKeepsTime", "SnailRemembers", "SnailGains"],
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
+    "broken_starts.py": ["HopperOfFriction"],
     "broken_unwrapped.py": ["ValveHasStops"],
 }
 """What looks like one of these mistakes, and is none."""
