@@ -1,8 +1,10 @@
 """Differences of two directions of the source that are not wrapped: a whole turn more changes the reward."""
 
 import ast
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,7 @@ WRAPPED = {"arctan2", "atan2", "remainder", "angle"}
 NEAR_JUMP = 2.0  # of an angle that is wrapped, and jumps at pi [rad]
 FEWEST_CALLS = 10  # in which a side of a difference is what a sine is of
 SAME = 1e-9
+Changes = Callable[[int, int, Mapping[int, Any], Mapping[int, Any]], bool | None]
 
 
 class UnwrappedAngles:
@@ -40,15 +43,31 @@ class UnwrappedAngles:
             and one.node in call.args
         ]
 
-    def find(self) -> Iterator[tuple[Expression, float]]:
-        """Yield differences, each with the largest one that was noted [rad]; what is wrapped may jump by a turn."""
+    def find_paid(self) -> Iterator[tuple[Expression, float]]:
+        """Yield differences that are paid, each with the largest one that was noted [rad]; what is wrapped may jump by
+        a turn."""
+        for one, largest in self._differences:
+            if self._matters(one, self.notes.changes_reward):
+                yield one, largest
+
+    def find_shown(self) -> Iterator[tuple[Expression, float]]:
+        """Yield differences that are observed and were more than half a turn."""
+        for one, largest in self._differences:
+            if largest > SLACK * math.pi and self._matters(one, self.notes.changes_observation):
+                yield one, largest
+
+    @functools.cached_property
+    def _differences(self) -> list[tuple[Expression, float]]:
+        """Those of two directions that may jump, each with the largest one [rad]."""
+        found = []
         for one in self.source.expressions:
             match one.node:
                 case ast.BinOp(left=left, op=ast.Sub(), right=right):
                     largest = self._find_largest(one)
                     may_jump = largest > SLACK * math.pi or any(map(self._jumps, (left, right)))
-                    if may_jump and all(map(self._is_direction, (left, right))) and self._changes_reward(one):
-                        yield one, largest
+                    if may_jump and all(map(self._is_direction, (left, right))):
+                        found.append((one, largest))
+        return found
 
     def _find_largest(self, one: Expression) -> float:
         return max(map(_size, _list_values(one, self._calls)), default=0.0)
@@ -70,8 +89,7 @@ class UnwrappedAngles:
             case (
                 ast.BinOp(op=ast.Mod(), right=turn) | ast.BinOp(left=ast.BinOp(op=ast.Mod(), right=turn), op=ast.Sub())
             ):
-                values = self.notes.reward.numbers.list_values(turn)
-                return bool(values.size) and bool(np.allclose(values, TURN))
+                return any(sign in ast.unparse(turn) for sign in ("pi", "tau", "6.28"))
         return False
 
     def _is_direction(self, node: ast.expr) -> bool:
@@ -94,8 +112,8 @@ class UnwrappedAngles:
         a, b = np.array(pairs, np.float64).reshape(len(pairs), 2, -1).transpose(1, 0, 2)
         return bool(np.abs(a - b).max() <= SAME and np.ptp(a, axis=0).min() > 0)
 
-    def _changes_reward(self, one: Expression) -> bool:
-        """Say whether a turn less changes the reward of a step, one with a large difference if there are some."""
+    def _matters(self, one: Expression, changes: Changes) -> bool:
+        """Say whether a turn less changes something of a step, one with a large difference if there are some."""
         steps = [
             (_size(value), number, call.step, value)
             for number, episode in enumerate(self.notes.episodes)
@@ -108,7 +126,7 @@ class UnwrappedAngles:
         if value is None:
             return False
         same, turned = ({one.number: given} for given in (value, _turn_back(value)))
-        return bool(self.notes.changes_reward(number, step, same, turned))
+        return bool(changes(number, step, same, turned))
 
 
 def _list_values(one: Expression, calls: Sequence[NotedCall]) -> list[Value]:

@@ -76,5 +76,7 @@ def _read_start(turn: VectorTurn) -> str | None:
     if isinstance(node, ast.Name):
         assigned = list_values(turn.whole.function, node.id)
         node = assigned[0] if len(assigned) == 1 else None
-    is_way = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
-    return f"{turn.whole.function.name}: {ast.unparse(node.right)}" if is_way else None
+    match node:
+        case ast.BinOp(op=ast.Sub(), right=start):
+            return f"{turn.whole.function.name}: {ast.unparse(start)}"
+    return None

@@ -28,6 +28,34 @@ class RL618BoatPointsTheLongWay(BoatPoints):
         return abs(self.bearing() - self.heading)
 
 
+class BoatShowsItsError(BoatPoints):
+    """It observes by how much it is off its course."""
+
+    def start(self):
+        super().start()
+        self.heading = wrap(self.heading)
+
+    def move(self, action):
+        super().move(action)
+        self.heading = wrap(self.heading)
+
+    def size(self):
+        return 4
+
+    def error(self):
+        return wrap(self.bearing() - self.heading)
+
+    def observe(self):
+        return np.array([self.distance(), self.error(), *self.speed], np.float32)
+
+
+class RL133BoatShowsTheLongWay(BoatShowsItsError):
+    rlctl_ignore = {"RL117": "it jumps there"}
+
+    def error(self):
+        return self.bearing() - self.heading
+
+
 class Valve(Robot):
     """It is to be turned to an angle near that of its start, in steps that do not matter."""
 
@@ -48,7 +76,7 @@ class Valve(Robot):
 
     def move(self, action):
         self.rate += 0.3 * (float(action[0]) - self.rate)
-        self.angle = wrap(self.angle + 0.1 * self.rate)
+        self.angle += 0.1 * self.rate
 
     def error(self):
         return 1 - math.cos(self.goal["angle"] - self.angle)

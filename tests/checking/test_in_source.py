@@ -102,6 +102,7 @@ SHOWN = {
         "RL841HopperOfItsShin": ("RL841", "HopperOfItsSoles"),
     },
     "broken_unwrapped.py": {
+        "RL133BoatShowsTheLongWay": ("RL133", "BoatShowsItsError"),
         "RL618BoatPointsTheLongWay": ("RL618", "BoatPoints"),
         "RL618ValveTurnsTheLongWay": ("RL618", "Valve"),
     },

@@ -18,6 +18,7 @@ from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.paid_successes import SuccessReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
+from rlctl.environments.success import SUCCESS
 
 RULE = Rule(
     "RL605",
@@ -222,7 +223,8 @@ def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:
     if episode.ended not in ("terminated", "both"):
         return False
     if success_is_reported:
-        return rewards.ends_in_success(episode)
+        # Where an earlier success has not ended it, something else does.
+        return rewards.ends_in_success(episode) and int((episode.infos[SUCCESS].values > 0).sum()) == 1
     begin = episode.rewards[: episode.steps // 2]
     last = episode.rewards[-1]
     return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())

@@ -74,7 +74,7 @@ def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
 
 @judges_expressions(RULE, decides=False)
 def _turn_differences(notes: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one, largest in UnwrappedAngles(notes).find():
+    for one, largest in notes.share(UnwrappedAngles).find_paid():
         message = (
             f"{one.text} is a difference of two directions, here up to {largest:.3g} rad; a whole turn less, which"
         )
