@@ -151,6 +151,7 @@ class GoalReader:
         return self.resolve_flag(returned[0]) if returned else None
 
     def resolve_flag(self, place: ReadExpression) -> ReadExpression:
+        """Follow names, calls and conversions to what a flag is computed by."""
         while True:
             match place.node:
                 case ast.Call(func=ast.Name(id="bool" | "float" | "int"), args=[only]):
