@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from rlctl.checking.worlds import (
     JointKey,
     Jump,
     Link,
+    MotorStrength,
     MotorTarget,
     Pair,
     Poses,
@@ -58,11 +60,15 @@ def _body(client: int, body: int) -> WorldBody:
         base = ""
     infos = [p.getJointInfo(body, i) for i in range(p.getNumJoints(body))]
     moving = [info for info in infos if info[2] in (p.JOINT_REVOLUTE, p.JOINT_PRISMATIC)]
-    joints = [Joint(i[0], i[1].decode(errors="replace"), i[2] == p.JOINT_REVOLUTE, i[8], i[9]) for i in moving]
+    joints = [_joint(info, info[2] == p.JOINT_REVOLUTE) for info in moving]
     links = [base, *(info[12].decode(errors="replace") for info in infos)]
     base_mass, *masses = (p.getDynamicsInfo(body, i)[0] for i in range(-1, len(infos)))
     name, has_heavy_links = name or base or "a body", bool(joints) and any(mass > 0 for mass in masses)
     return WorldBody(body, name, tuple(links), tuple(joints[:MOST_JOINTS]), base_mass > 0, has_heavy_links)
+
+
+def _joint(info: Sequence[Any], is_angle: bool) -> Joint:
+    return Joint(info[0], info[1].decode(errors="replace"), is_angle, info[8], info[9], effort=info[10])
 
 
 def read_states(world: World) -> list[Array]:
@@ -249,7 +255,29 @@ class BulletStateReader:
         """See `StateReader`; only what was set by a position."""
         targets = self._calls.targets.values()
         own = [target for target in targets if target.client == self.world.client]
-        return {(t.body, t.joint): MotorTarget(t.value, t.force, t.call.name, (t.call.file, t.call.line)) for t in own}
+        factor = self._read_motor_factor() if own else 1
+        return {
+            (t.body, t.joint): MotorTarget(t.value, factor * t.force, t.call.name, (t.call.file, t.call.line))
+            for t in own
+        }
+
+    def _read_motor_factor(self) -> int:
+        """Return how many times stronger motors are than they are told: PyBullet computes a motor's impulse for the
+        time of a whole step, and applies it in every substep."""
+        return max(1, int(ClientCalls(self.world.client).getPhysicsEngineParameters()["numSubSteps"]))
+
+    def read_strengths(self) -> dict[JointKey, MotorStrength]:
+        """See `StateReader`."""
+        found: dict[JointKey, MotorStrength] = {}
+        for (client, body, joint), torque in self._calls.torques.items():
+            if client == self.world.client:
+                found[body, joint] = MotorStrength(torque.value, True, (torque.call.file, torque.call.line))
+        factor = self._read_motor_factor()
+        for (client, body, joint), given in self._calls.strengths.items():
+            if client == self.world.client:
+                where = (given.call.file, given.call.line)
+                found[body, joint] = MotorStrength(factor * given.value, given.speed > 0, where)
+        return found
 
     def read_weights(self) -> dict[JointKey, float]:
         """See `StateReader`; empty where a constraint may carry a robot."""

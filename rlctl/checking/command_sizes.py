@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator, Sequence
 
@@ -13,11 +14,13 @@ from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, PART, ErrorReader, Numbers, has_both_signs
 from rlctl.checking.products import list_product
+from rlctl.checking.source_code import Function
 from rlctl.checking.summands import Summand
 
 SIZES = {"norm", "hypot", "abs", "absolute", "fabs", "square", "sqrt"}
 SAME_SIGN = CONVERSIONS | {"sum", "mean", "max", "min", "clip", "round"}
 BEGINNINGS = {"zeros", "zeros_like"}
+FEWEST_STEPS = 3  # before the one whose command is turned round
 MOST_SEEN = 100  # names that are followed
 MET = 0.98  # of the largest value of a kernel: what a tolerance pays that everything meets
 CLEARLY, MOST_CHANGES = 0.25, 0.1  # parts: of the largest difference, of the steps
@@ -60,6 +63,53 @@ class SizeReader:
                 self._lengths = []
                 if self._is_never_negative(other, set()) and self._lengths:
                     yield OneSided(summand, place, self._lengths[0])
+
+    def find_sizes_only(self) -> Iterator[OneSided]:
+        """Yield differences of two sizes, one of them of a command with both signs, where its sign changes nothing."""
+        for summand in self.reward.summands:
+            for one in self.definitions.walk(summand.place):
+                match one.node:
+                    case ast.BinOp(left=left, op=ast.Sub(), right=right):
+                        inner = [self._read_inside(one.at(side)) for side in (left, right)]
+                        if None not in inner and any(
+                            self._is_signed_command(side) for side in inner if side is not None
+                        ):
+                            yield OneSided(summand, one, left)
+
+    def _read_inside(self, place: ReadExpression) -> ReadExpression | None:
+        """Return of what a number is the size."""
+        resolved = self.definitions.resolve(place)
+        match resolved.node:
+            case ast.Call(func=function, args=[only]) if read_name(function) in SIZES - {"square", "sqrt"}:
+                return resolved.at(only)
+        return None
+
+    def _is_signed_command(self, place: ReadExpression) -> bool:
+        values = self.reward.numbers.list_values(place.node)
+        is_signed = values.size >= FEWEST and has_both_signs(values, PART)
+        return is_signed and self._is_kept(place.node) and not self._is_sign_paid(place)
+
+    def _is_sign_paid(self, place: ReadExpression) -> bool:
+        """Say whether the opposite command changes the reward, wherever this reads it."""
+        text, functions = ast.unparse(place.node), self._readers | {place.function}
+        numbers = [
+            one.number for one in self.notes.source.expressions if one.text == text and one.function in functions
+        ]
+        for number, episode in enumerate(self.notes.episodes):
+            for call in episode[FEWEST_STEPS:]:
+                values = [call.values[one][-1] for one in numbers if call.values.get(one)]
+                if values and values[0] is not None and np.any(values[0]):
+                    opposite = dict.fromkeys(numbers, -values[0])
+                    return self.notes.changes_reward(number, call.step, {}, opposite) is not False
+        return True
+
+    @functools.cached_property
+    def _readers(self) -> set[Function]:
+        """The functions that compute the reward and set nothing: others move the robot."""
+        walked = {one.function for summand in self.reward.summands for one in self.definitions.walk(summand.place)}
+        return {
+            one for one in walked if not any(key.startswith("self.") for key in self.definitions.list_assigned(one))
+        }
 
     def _list_differences(
         self, place: ReadExpression
@@ -157,16 +207,20 @@ class SizeReader:
     def _is_drawn(self, difference: ReadExpression, wanted: ReadExpression) -> bool:
         """Say whether a command differs between episodes as much as the difference to it, and is kept in them."""
         differences, commands = (self.reward.numbers.list_values(one.node) for one in (difference, wanted))
-        noted = self.notes.source.find(wanted.node)
-        if noted is None or differences.size < FEWEST:
+        if differences.size < FEWEST:
             return False
+        is_apart = np.ptp(commands) > CLEARLY * float(np.abs(differences).max())
+        return bool(is_apart and self._is_kept(wanted.node))
+
+    def _is_kept(self, node: ast.expr) -> bool:
+        """Say whether a value stays the same in most steps."""
+        noted = self.notes.source.find(node)
         changes = [
             not np.array_equal(before, after)
             for episode in self.notes.episodes
-            for before, after in itertools.pairwise(_list_last(episode[1:], noted.number))
+            for before, after in itertools.pairwise(_list_last(episode[1:], noted.number) if noted is not None else ())
         ]
-        is_kept = bool(changes) and np.mean(changes) <= MOST_CHANGES
-        return bool(is_kept and np.ptp(commands) > CLEARLY * float(np.abs(differences).max()))
+        return bool(changes) and bool(np.mean(changes) <= MOST_CHANGES)
 
 
 def _list_last(calls: Sequence[NotedCall], number: int) -> list[Numbers]:

@@ -44,6 +44,8 @@ class GoalDistance:
     expression: Expression
     summands: tuple[Summand, ...]  # of the reward, that are computed from it
     largest: float  # that was noted
+    sides: tuple[ReadExpression, ReadExpression]  # the two things whose distance it is
+    is_told: bool  # Whether names tell that it is the distance to something that is to be reached
 
 
 class DistanceReader:
@@ -55,9 +57,14 @@ class DistanceReader:
     @functools.cached_property
     def distances(self) -> list[GoalDistance]:
         """Those that the reward may be computed from, in the order of the source."""
-        found = list(self._list_distances())
+        found = [one for one in self.measured if one.is_told]
         inner = {part for one in found for part in ast.walk(one.expression.node) if part is not one.expression.node}
         return [one for one in found if one.expression.node not in inner]
+
+    @functools.cached_property
+    def measured(self) -> list[GoalDistance]:
+        """All distances that the reward may be computed from, but for those from what is to be kept away from."""
+        return list(self._list_distances())
 
     def _list_distances(self) -> Iterator[GoalDistance]:
         evaluated = {number for call in self.notes.steps for number in call.values}
@@ -73,8 +80,9 @@ class DistanceReader:
                 continue
             summands = tuple(self._list_summands(one))
             is_unread = len(self._walked) < FEWEST_SUMMANDS  # as in a step that calls the one of another class
-            if (summands or is_unread) and self._is_to_be_reached(one, sides, summands):
-                yield GoalDistance(one, summands, float(values.max()))
+            is_told = self._is_to_be_reached(one, sides, summands) if summands or is_unread else None
+            if is_told is not None:
+                yield GoalDistance(one, summands, float(values.max()), sides, is_told)
 
     def _list_summands(self, one: Expression) -> Iterator[Summand]:
         """Yield the summands that are computed from an expression, or from what the own function returns that it
@@ -148,12 +156,13 @@ class DistanceReader:
 
     def _is_to_be_reached(
         self, one: Expression, sides: tuple[ReadExpression, ReadExpression], summands: tuple[Summand, ...]
-    ) -> bool:
+    ) -> bool | None:
+        """Say whether names tell it; None where they tell the opposite."""
         left, right = (self._list_words(side) for side in sides)
         names = self._list_titles(one.node)
         titles = names | {word for one in summands for name in (one.name, *one.names) for word in split_name(name)}
         if (left | right | titles) & AWAY_WORDS or (left | right | names) & EARLIER_WORDS:
-            return False
+            return None
         is_of_goal = bool(left & TARGET_WORDS) != bool(right & TARGET_WORDS)
         is_of_hand = any(one & HAND_WORDS and two & OBJECT_WORDS for one, two in ((left, right), (right, left)))
         is_called_so = bool(names & (REACH_WORDS | TARGET_WORDS))

@@ -25,6 +25,7 @@ from rlctl.checking.worlds import (
     JointKey,
     Jump,
     Link,
+    MotorStrength,
     MotorTarget,
     Pair,
     Poses,
@@ -35,7 +36,12 @@ from rlctl.environments.info import find_mujoco
 
 FREE, BALL, SLIDE, HINGE = range(4)  # MuJoCo's types of joints
 PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields
-ON_JOINT, FIXED_GAIN, AFFINE = (0, 1), 0, 1  # Types of actuators: what they move, and how they compute their force
+ON_JOINT, FIXED_GAIN, NO_BIAS, AFFINE = (
+    (0, 1),
+    0,
+    0,
+    1,
+)  # Types of actuators: what they move, and how they compute their force
 LINEAR = (FIXED_GAIN, AFFINE)
 FIELDS = ("data.", "model.")
 KEPT = (
@@ -112,7 +118,8 @@ def _joint(model: Any, joint: int) -> Joint:
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (0.0, -1.0)
     name = model.joint(joint).name or f"joint {joint}"
     link = model.body(int(model.jnt_bodyid[joint])).name
-    return Joint(joint, name, int(model.jnt_type[joint]) != SLIDE, float(low), float(high), link)
+    effort = float(np.abs(model.jnt_actfrcrange[joint]).max()) if model.jnt_actfrclimited[joint] else 0.0
+    return Joint(joint, name, int(model.jnt_type[joint]) != SLIDE, float(low), float(high), link, effort)
 
 
 def _motor(model: Any, actuator: int) -> JointActuator | None:
@@ -296,6 +303,24 @@ class MujocoStateReader:
                 value = float(gain * self.data.ctrl[number] + offset) / float(-pull * motor.gear)
                 targets[motor.body, motor.joint.index] = MotorTarget(value, force, f"actuator {motor.name}")
         return targets
+
+    def read_strengths(self) -> dict[JointKey, MotorStrength]:
+        """See `StateReader`; of the present model, and of the strongest of several motors of a joint."""
+        found: dict[JointKey, MotorStrength] = {}
+        for motor in self.world.motors:
+            key, force = (motor.body, motor.joint.index), self._find_strength(motor)
+            if math.isfinite(force) and (key not in found or force > found[key].force):
+                found[key] = MotorStrength(force, is_driven=not motor.holds_position)
+        return found
+
+    def _find_strength(self, motor: JointActuator) -> float:
+        """Return the most that an actuator can do [N m], [N]; infinite where nothing limits it, or it is not linear."""
+        model, number = self.model, motor.number
+        if model.actuator_forcelimited[number]:
+            return float(np.abs(model.actuator_forcerange[number]).max()) * abs(motor.gear)
+        is_force = (int(model.actuator_gaintype[number]), int(model.actuator_biastype[number])) == (FIXED_GAIN, NO_BIAS)
+        gain = float(model.actuator_gainprm[number, 0])
+        return max(abs(motor.low), abs(motor.high)) * abs(gain * motor.gear) if is_force else math.inf
 
     def read_command(self) -> Array | None:
         """See `StateReader`."""

@@ -9,6 +9,7 @@ import numpy as np
 from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.lengths import read_vector
 from rlctl.checking.paid_errors import COMMAND_WORDS, WANTED_WORDS, ErrorReader, has_both_signs
 from rlctl.checking.summands import Summand
 from rlctl.checking.term_names import split_name
@@ -153,10 +154,8 @@ class CommandReader:
     def _read_length(self, place: ReadExpression) -> ReadExpression | None:
         """Return the vector of which an expression is the length."""
         place = self.definitions.resolve(place)
-        match place.node:
-            case ast.Call(func=function, args=[only, *_]) if read_name(function) == "norm":
-                return place.at(only)
-        return None
+        parts = read_vector(place.node)
+        return None if parts is None else place.at(parts[0])
 
     def _has_command(self, place: ReadExpression) -> bool:
         return any(_is_command(one.node, COMMAND_WORDS) for one in (place, self.definitions.resolve(place)))

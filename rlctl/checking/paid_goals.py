@@ -143,14 +143,15 @@ class GoalReader:
                 case ast.Dict(keys=keys, values=values):
                     for key, value in zip(keys, values, strict=True):
                         if isinstance(key, ast.Constant) and key.value in SUCCESS_KEYS:
-                            return self._resolve_flag(ReadExpression(value, step, {}))
+                            return self.resolve_flag(ReadExpression(value, step, {}))
                 case ast.Assign(targets=[ast.Subscript(slice=ast.Constant(value=key))], value=value):
                     if key in SUCCESS_KEYS:
-                        return self._resolve_flag(ReadExpression(value, step, {}))
+                        return self.resolve_flag(ReadExpression(value, step, {}))
         returned = self.definitions.list_results(self.definitions.find_function("is_success"))
-        return self._resolve_flag(returned[0]) if returned else None
+        return self.resolve_flag(returned[0]) if returned else None
 
-    def _resolve_flag(self, place: ReadExpression) -> ReadExpression:
+    def resolve_flag(self, place: ReadExpression) -> ReadExpression:
+        """Follow names, calls and conversions to what a flag is computed by."""
         while True:
             match place.node:
                 case ast.Call(func=ast.Name(id="bool" | "float" | "int"), args=[only]):
@@ -163,7 +164,7 @@ class GoalReader:
 
     def is_success(self, test: ast.expr, place: ReadExpression) -> bool:
         """Say whether a test asks for success."""
-        asked = self._resolve_flag(place.at(test)).node
+        asked = self.resolve_flag(place.at(test)).node
         return any(asked is part.node for part in self.success_parts)
 
     @functools.cached_property
@@ -173,7 +174,7 @@ class GoalReader:
         parts = [success] if success is not None else []
         for part in parts:
             if isinstance(part.node, ast.BoolOp) and isinstance(part.node.op, ast.And):
-                parts += [self._resolve_flag(part.at(one)) for one in part.node.values]
+                parts += [self.resolve_flag(part.at(one)) for one in part.node.values]
         return parts
 
     def ends_at_success(self) -> bool:

@@ -3,18 +3,21 @@
 import ast
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from rlctl.checking.assignments import list_name_words
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.forced_rewards import ForcedRewards
 from rlctl.checking.goal_distances import DistanceReader
 from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.previous_values import PREVIOUS_WORDS
 
 PARTS = (0.03, 0.06, 0.12, 0.25)  # of the largest distance to the goal that was noted
 EPISODES = (0, 3)  # that are played again
+NEAR_PARTS = PARTS[:3]
 LASTING = 2  # steps at one distance, in which there is no progress
 CLEARLY, LEAST = 0.02, 1e-6  # part of the rewards, by which success pays less
 MOST_FLAGS = 5
@@ -52,6 +55,53 @@ class SuccessReader:
             if found is None:
                 break
         return found
+
+    def read_incomes(self) -> tuple[float, float] | None:
+        """Return what a step next to the goal pays, with all that is paid for besides success, and what a success pays.
+
+        None where this cannot be played, or success does not change the reward.
+        """
+        place = self.goals.read_success()
+        if place is None or not self.distances or self._find_number(place) is None or not self._decides(place):
+            return None
+        found = [one for episode in EPISODES if (one := self._read_incomes(episode, place)) is not None]
+        return min(found, key=lambda one: one[0]) if found else None
+
+    def _read_incomes(self, episode: int, place: ReadExpression) -> tuple[float, float] | None:
+        last = self.forced.find_last(episode)
+        if last is None:
+            return None
+        success = dict.fromkeys(self._list_same(place), True)
+        met = {number: value for _, one in self._list_flags() for number, value in one.items()}
+        kept = self._list_paid_flags() | met | dict.fromkeys(success, False)
+        nearest = {number: PARTS[0] * largest for number, largest in self.distances.items()}
+        paid = self._pay(episode, last, nearest | kept, success)
+        staying = []
+        for part in NEAR_PARTS:
+            near = {number: part * largest for number, largest in self.distances.items()}
+            if not self._succeeds(episode, last, near, place):
+                staying.append(self._pay(episode, last, near | kept, {}))  # for a change of a flag nothing is paid then
+        return (min(staying), paid) if staying and math.isfinite(paid) else None  # the least: others may pay once
+
+    def _list_paid_flags(self) -> Flags:
+        """Return the flags that last, such as a grasp, for which the reward pays besides success; and what they are."""
+        found: Flags = {}
+        for summand in self.goals.reward.summands:
+            for test, is_true in ((summand.place.node, True), *summand.conditions) if summand.weight > 0 else ():
+                flag = self.goals.resolve_flag(summand.place.at(test))
+                if self._lasts(flag) and not self.goals.is_success(test, summand.place):
+                    found |= dict.fromkeys(self._list_same(flag), is_true)
+        return found
+
+    def _lasts(self, flag: ReadExpression) -> bool:
+        """Say whether it is a flag that neither a distance nor a change tells."""
+        if isinstance(flag.node, ast.BoolOp) or self.notes.source.find(flag.node) is None:
+            return False
+        parts = [place.node for place in self.definitions.walk(flag)]
+        numbers = {one.number for node in parts if (one := self.notes.source.find(node)) is not None}
+        is_of_change = any(list_name_words(node) & PREVIOUS_WORDS for node in parts)
+        values = self.goals.reward.numbers.list_values(flag.node)
+        return bool(values.size) and set(values) <= {0.0, 1.0} and not (numbers & self.distances.keys() or is_of_change)
 
     def _decides(self, place: ReadExpression) -> bool:
         """Say whether the reward is another one where success is told otherwise."""
@@ -127,7 +177,7 @@ class SuccessReader:
         for text, one in flags:
             yield text, met | {number: not value for number, value in one.items()} | failure
 
-    def _pay(self, episode: int, last: int, near: dict[int, float], flags: Flags) -> float:
+    def _pay(self, episode: int, last: int, near: Mapping[int, float | bool], flags: Flags) -> float:
         paid = self.forced.pay(episode, last, near, LASTING, flags)[0]
         return paid if math.isfinite(paid) else -math.inf
 

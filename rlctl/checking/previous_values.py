@@ -64,8 +64,12 @@ class KeptDifferences:
         self.differences = [one for expression in noted.source.expressions for one in self._read(expression)]
 
     def _read(self, whole: Expression) -> Iterator[KeptDifference]:
-        sides = _read_sides(whole.node)
-        for one, other in (sides, sides[::-1]) if sides else ():
+        if (sides := read_sides(whole.node)) is not None:
+            yield from self.read_pair(whole, sides)
+
+    def read_pair(self, whole: Expression, sides: tuple[ast.expr, ast.expr]) -> Iterator[KeptDifference]:
+        """Yield an expression of two sides as one of what an attribute has kept and of another value."""
+        for one, other in (sides, sides[::-1]):
             kept, new = self.noted.source.find(one), self.noted.source.find(other)
             origin = self.definitions.find_origin(one, whole.function)
             if kept is None or new is None or not (key := read_key(origin)) or key not in self.definitions.assigned:
@@ -74,37 +78,18 @@ class KeptDifferences:
             if ast.unparse(new_origin) != ast.unparse(origin):
                 yield KeptDifference(whole, kept, new, key, new_origin)
 
-    def find_always_zero(self) -> Iterator[KeptDifference]:
-        """Yield differences that are 0 in each step, since what is kept has been replaced before."""
-        for one in self.differences:
-            episodes = [one.list_values(episode[1:]) for episode in self.noted.episodes]
-            sizes = [_size(values[0]) for episode in episodes for values in episode]
-            if not sizes or None in sizes or not (is_previous_key(one.key) or self._is_copied(one)):
-                continue
-            changes = [step for episode in episodes for step in _changes([values[2] for values in episode])]
-            moving = [step for step in changes if step > 0]
-            largest = max((size for size in sizes if size is not None), default=0.0)
-            if len(moving) >= FEWEST_CHANGES and largest <= ZERO * float(np.median(moving)) and self.is_paid(one):
-                yield one
-
-    def _is_copied(self, one: KeptDifference) -> bool:
-        """Say whether a step replaces what is kept by a copy of the new value."""
-        for assignment in self.definitions.assigned[one.key]:
-            origin = self.definitions.find_origin(assignment.value, assignment.function)
-            if assignment.function in self.noted.of_steps and ast.unparse(origin) == ast.unparse(one.origin):
-                return True
-        return False
-
     def find_never_replaced(self) -> Iterator[KeptDifference]:
         """Yield differences whose kept value stays what reset has set, although steps subtract it."""
         for one in self.differences:
             if not is_previous_key(one.key) or self._may_be_replaced(one):
                 continue
             episodes = [one.list_values(episode[1:]) for episode in self.noted.episodes]
-            replaced = [change > 0 for episode in episodes for change in _changes([values[1] for values in episode])]
+            replaced = [
+                change > 0 for episode in episodes for change in list_changes([values[1] for values in episode])
+            ]
             if not replaced or np.mean(replaced) > MOST_REPLACED:
                 continue
-            changes = [change for episode in episodes for change in _changes([values[2] for values in episode])]
+            changes = [change for episode in episodes for change in list_changes([values[2] for values in episode])]
             moving = np.array([change for change in changes if change > 0])
             if len(moving) < FEWEST_CHANGES or np.ptp(moving) < ZERO * moving.max():  # that is a clock
                 continue
@@ -119,8 +104,10 @@ class KeptDifferences:
         )
 
     def comes_with_goal(self, assignment: Assignment) -> bool:
-        """Say whether an assignment stands under an `if`, or in a function, that also sets a goal."""
+        """Say whether an assignment stands under an `if`, or in a function besides `step`, that also sets a goal."""
         conditions = self.definitions.list_conditions(assignment.statement)
+        if not conditions and assignment.function is self.definitions.find_function("step"):
+            return False
         blocks: list[Sequence[ast.AST]] = [] if conditions else [assignment.function.body]
         for test, is_met in conditions:
             branch = self.noted.source.parents[test]
@@ -162,7 +149,8 @@ def _is_goal_itself(name: str) -> bool:
     return is_place(name) and not {*split_name(name)} & (ERROR_WORDS | SIZE_WORDS)
 
 
-def _read_sides(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
+def read_sides(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
+    """Return what is subtracted from each other; None for other expressions."""
     match node:
         case ast.BinOp(left=left, op=ast.Sub(), right=right):
             return left, right
@@ -171,11 +159,7 @@ def _read_sides(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
     return None
 
 
-def _size(value: Value) -> float | None:
-    return None if value is None else float(np.max(np.abs(value), initial=0.0))
-
-
-def _changes(values: Sequence[Value]) -> list[float]:
+def list_changes(values: Sequence[Value]) -> list[float]:
     """Return how far values are from those before; 0 where they are the same."""
     found = []
     for before, after in itertools.pairwise(values):

@@ -1,4 +1,4 @@
-"""Costs of a reward that are one number with its sign, such as the sine of a tilt: half of the time they pay."""
+"""Costs of a reward that are a number with its sign, such as the sine of a tilt: half of the time they pay."""
 
 import ast
 from collections.abc import Iterator
@@ -14,9 +14,9 @@ from rlctl.checking.term_names import COST_WORDS, OPPOSITE_WORDS, split_name
 
 SMALL_WORDS = COST_WORDS | {
     "across", "attitude", "balance", "bank", "bearing", "center", "centering", "centre", "cross", "crosstrack", "cte",
-    "deviation", "drift", "err", "error", "heading", "lateral", "lean", "level", "misalignment", "off", "offset",
-    "pitch", "posture", "roll", "side", "sideways", "skew", "slant", "straight", "sway", "swing", "tilt", "turn",
-    "turned", "twist", "upright", "wobble", "yaw",
+    "asymmetry", "deviation", "drift", "err", "error", "heading", "imbalance", "lateral", "lean", "level",
+    "misalignment", "off", "offset", "pitch", "posture", "roll", "side", "sideways", "skew", "slant", "straight",
+    "sway", "swing", "tilt", "turn", "turned", "twist", "unbalanced", "unequal", "uneven", "upright", "wobble", "yaw",
 }  # fmt: skip
 """What a cost is named after that should be 0."""
 MEANT_WORDS = (OPPOSITE_WORDS - {"exp"}) | {
@@ -39,7 +39,7 @@ class SignedCostReader:
 
     def find(self) -> Iterator[tuple[Summand, ReadExpression]]:
         """Yield the summand, and what it is."""
-        for summand in self.reward.summands:
+        for summand in (*self.reward.summands, *self.reward.differences):
             if summand.weight < 0:
                 hops = self._list_hops(summand.place)
                 if self._has_both_signs(summand.place) and self._should_be_small(summand, hops) and self._is_one(hops):
@@ -86,7 +86,7 @@ class SignedCostReader:
         return bool(words & SMALL_WORDS) or any(self.errors.is_sized(text) for text in arguments)
 
     def _is_one(self, hops: list[ReadExpression]) -> bool:
-        """Say whether it is one number, and neither a product, nor a sum, nor a change."""
+        """Say whether it is one number, or the difference of two of an array, and neither a product nor a change."""
         last = hops[-1]
         differences = [hop for hop in hops if isinstance(hop.node, ast.BinOp) and isinstance(hop.node.op, ast.Sub)]
         if any(map(self.errors.is_between_steps, differences)):
@@ -96,6 +96,8 @@ class SignedCostReader:
                 return read_name(function) not in ("cos", "sum", "mean", "dot", "vdot", "einsum", "cross", "max", "min")
             case ast.BinOp(op=ast.Mod()):
                 return True
+            case ast.BinOp(left=ast.Subscript(value=one), op=ast.Sub(), right=ast.Subscript(value=other)):
+                return ast.unparse(one) == ast.unparse(other)
             case ast.BinOp(left=left, op=ast.Sub() | ast.Add()):
                 # (a - b + pi) % (2 * pi) - pi
                 return isinstance(left, ast.BinOp) and isinstance(left.op, ast.Mod)

@@ -125,15 +125,14 @@ def _find_added(
             continue
         for summand in _list_summands(added):
             factors = _list_factors(summand, one)
-            times = [
-                (factor, seconds) for factor in factors if (seconds := _read_time(factor, one, constants)) is not None
-            ]
+            times = [seconds for factor, _ in factors if (seconds := _read_time(factor, one, constants)) is not None]
             if len(times) == 1:
-                is_clock = all(factor in constants or isinstance(factor, ast.Constant) for factor in factors)
+                is_clock = all(factor in constants or isinstance(factor, ast.Constant) for factor, _ in factors)
                 use = Use.COUNTED if is_clock else Use.INTEGRATED
                 most = _count(source, one, target, steps)
+                seconds = times[0] * _multiply_counts(factors, one, constants)
                 if most:
-                    yield TimedExpression(use, ast.unparse(target), one.text, times[0][1], most, one.where)
+                    yield TimedExpression(use, ast.unparse(target), one.text, seconds, most, one.where)
 
 
 def _read_sum(source: SourceCode, node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
@@ -163,25 +162,42 @@ def _is_of_loop(target: ast.expr, one: Expression) -> bool:
 
 
 def _list_summands(node: ast.expr) -> Iterator[ast.expr]:
-    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
-        yield from _list_summands(node.left)
-        yield from _list_summands(node.right)
-    elif isinstance(node, ast.UnaryOp):
-        yield from _list_summands(node.operand)
-    else:
-        yield node
+    """Yield the parts of a sum, also of the entries of an array."""
+    match node:
+        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
+            yield from _list_summands(left)
+            yield from _list_summands(right)
+        case ast.UnaryOp(operand=operand):
+            yield from _list_summands(operand)
+        case ast.Call(func=ast.Attribute(attr="array" | "asarray"), args=[ast.List(elts=entries), *_]):
+            for entry in entries:
+                yield from _list_summands(entry)
+        case _:
+            yield node
 
 
-def _list_factors(node: ast.expr, one: Expression) -> list[ast.expr]:
-    """Return the factors of a product, also those of what is divided."""
+def _list_factors(node: ast.expr, one: Expression) -> list[tuple[ast.expr, int]]:
+    """Return the factors of a product, each with its exponent: -1 of what it is divided by."""
     match node:
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
             return _list_factors(left, one) + _list_factors(right, one)
         case ast.BinOp(op=ast.Div(), left=left, right=right) if not _is_named_time(node, one):
-            return [*_list_factors(left, one), right]
+            return [*_list_factors(left, one), (right, -1)]
         case ast.Call(func=ast.Name(id="float"), args=[only]):
             return _list_factors(only, one)
-    return [node]
+    return [(node, 1)]
+
+
+def _multiply_counts(
+    factors: Sequence[tuple[ast.expr, int]], one: Expression, constants: Mapping[ast.expr, float]
+) -> float:
+    """Return the product of the factors that say how often something is repeated in a step."""
+    counts = [
+        constants[factor] ** exponent
+        for factor, exponent in factors
+        if constants.get(factor) and not isinstance(factor, ast.Constant) and _is_count(factor, one)
+    ]
+    return math.prod(counts)
 
 
 def _read_time(node: ast.expr, one: Expression, constants: Mapping[ast.expr, float]) -> float | None:

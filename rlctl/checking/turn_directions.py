@@ -11,7 +11,8 @@ from rlctl.checking.attitudes import compute_matrices
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.source_code import Expression
 from rlctl.checking.turned_expressions import VectorTurn
-from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries
+from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, MOSTLY, NEARLY_ALL, SAME, Array, VectorSeries
+from rlctl.checking.world_places import is_of_engine, is_place
 
 INVERSE_WORDS = {"inv", "inverse", "invert", "conj", "conjugate", "transpose"}
 ANGLE_WORDS = {"yaw", "heading", "theta", "psi", "course", "euler", "rpy", "joint", "joints", "angle", "qpos", "turn"}
@@ -86,7 +87,7 @@ class Directions:
         if usable.sum() < FEWEST:
             return None
         found = []
-        for one, rows in self._angles:
+        for one, rows in self.angles:
             if rows.shape[1] not in (1, angles.shape[1]):
                 continue
             known = np.broadcast_to(rows, angles.shape)
@@ -109,17 +110,58 @@ class Directions:
                 order = WXYZ if "mujoco" in self._libraries else XYZW
                 yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
                 return yaw.reshape(rows.shape[:2])
-        angles = [rows for one, rows in self._angles if one.text == text]
+        angles = [rows for one, rows in self.angles if one.text == text]
         return max(angles, key=lambda rows: np.isfinite(rows).sum(), default=None)  # some are read at resets only
 
     @functools.cached_property
-    def _angles(self) -> list[tuple[Expression, Array]]:
+    def angles(self) -> list[tuple[Expression, Array]]:
         """What is called an angle about the vertical, and is no argument: that may be another one's opposite."""
         kinds = ast.Name | ast.Attribute | ast.Subscript | ast.Call
         named = [one for one in self.series.source.expressions if isinstance(one.node, kinds)]
-        named = [one for one in named if list_words(one.node) & ANGLE_WORDS and _rank(one) < 2]
         found = [(one, self.series.read(one.node)) for one in named]
-        return [(one, rows) for one, rows in found if rows is not None]
+        return [
+            (one, rows)
+            for one, rows in found
+            if rows is not None
+            and ((list_words(one.node) & ANGLE_WORDS and _rank(one) < 2) or (self._is_given(one) and self._grows(rows)))
+        ]
+
+    def _is_given(self, one: Expression) -> bool:
+        """Say whether a function is called with an expression."""
+        parents = self.series.source.parents
+        call = parents[one.node]
+        while isinstance(call, ast.UnaryOp):
+            call = parents[call]
+        return not isinstance(one.node, ast.Call) and isinstance(call, ast.Call) and one.node is not call.func
+
+    @functools.cached_property
+    def _places(self) -> list[Array]:
+        places = [rows for one, rows in self.series.vectors if is_place(one) or is_of_engine(one)]
+        places += [side for way in self.series.differences for side in way.sides]
+        return list({rows.tobytes(): rows for rows in places}.values())
+
+    def counts_forwards(self, text: str) -> bool:
+        """Say whether the motion of the robot shows that a rotation by an angle is the one from it to the world."""
+        return any(self._grows(rows) for one, rows in self.angles if one.text == text)
+
+    def _grows(self, angles: Array) -> bool:
+        """Say whether a place goes round the vertical as an angle grows, or moves straight ahead by it."""
+        if np.nanstd(angles) < LEAST_SPREAD:
+            return False
+        turned = np.diff(angles, axis=0)
+        for rows in (rows for rows in self._places if rows.shape[:2] == angles.shape):
+            x, y = np.diff(rows[..., :2], axis=0).transpose(2, 0, 1)
+            round_it = np.diff(np.arctan2(rows[..., 1], rows[..., 0]), axis=0)
+            ahead = np.arctan2(y, x)
+            for off, moving in (
+                ((round_it - turned) / 2, np.abs(turned) > SAME),
+                (ahead - angles[1:], np.hypot(x, y) > SAME),
+                (ahead - angles[:-1], np.hypot(x, y) > SAME),
+            ):
+                known = moving & np.isfinite(off) & (np.abs(turned) > SAME)
+                if known.sum() >= FEWEST and (np.abs(np.sin(off[known])) < 1e-5).mean() > MOSTLY:
+                    return True
+        return False
 
 
 def _choose(found: Sequence[tuple[int, int, str]]) -> tuple[int, str] | None:

@@ -12,6 +12,8 @@ from rlctl.checking.assignments import list_parameters
 from rlctl.checking.source_code import Expression, Function
 from rlctl.checking.vector_series import FEWEST, HARDLY_ANY, NEARLY_ALL, SAME, Array, VectorSeries
 
+WRITING = {"mju_rotVecQuat", "mju_mulMatVec", "mju_mulMatVec3", "mju_mulMatTVec", "mju_mulMatTVec3"}
+"""Functions of MuJoCo that write what they compute into the first argument."""
 LEAST_TURN = 0.002  # of a vector's length, that a turn moves it
 
 
@@ -41,11 +43,36 @@ def find_turns(series: VectorSeries) -> Iterator[VectorTurn]:
             case ast.Call(args=args, keywords=keywords, func=function):
                 parts = [*args, *(keyword.value for keyword in keywords)]
                 parts += [function.value] if isinstance(function, ast.Attribute) else []
+            case ast.Subscript(value=ast.Call(args=args)):
+                parts = [*args]
+            case ast.Name() if any(series.read(one.node, size=size) is not None for size in (2, 3)):
+                parts = _list_arguments(one)
         for part, size in itertools.product(parts, (2, 3)):
             before, after = series.read(part, size=size), series.read(one.node, size=size)
             if before is not None and after is not None and _is_turn(before, after):
                 yield VectorTurn(one, part, ast.unparse(part), before, after)
     yield from _find_written_out(series)
+
+
+def _list_arguments(one: Expression) -> list[ast.expr]:
+    """Return what was given to the function that returns a name among others, or that writes into it, if nothing else
+    sets it."""
+    found: list[list[ast.expr]] = []
+    for node in ast.walk(one.function):
+        match node:
+            case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Call(args=args)) if _has(targets, one):
+                found.append(args)
+            case ast.Call(func=ast.Attribute(attr=name), args=[out, *args]) if name in WRITING and _has([out], one):
+                if node.lineno < one.node.lineno:
+                    found.append(args)
+            case ast.Name(ctx=ast.Store()) if _has([node], one):
+                found.append([])
+    given = [args for args in found if args]
+    return given[0] if len(given) == 1 and len(found) == 2 else []
+
+
+def _has(nodes: list[ast.expr], one: Expression) -> bool:
+    return any(isinstance(node, ast.Name) and node.id == ast.unparse(one.node) for node in nodes)
 
 
 def _is_turn(before: Array, after: Array) -> bool:

@@ -76,7 +76,7 @@ def compare_episodes(episodes: Sequence[TurnedEpisode], usual: Numbers) -> Turni
         weights = np.linalg.lstsq(one, flat, rcond=None)[0]
         shape = (-1, *rows.shape[1:])
         left = np.abs(flat - one @ weights).reshape(shape).max(axis=(0, 1), initial=0.0) / size
-        constant = np.abs(weights[2]).reshape(rows.shape[1:]).max(axis=0, initial=0.0)  # such as noise
+        constant = np.sqrt(np.square(weights[2]).reshape(rows.shape[1:]).mean(axis=0))  # such as noise
         amplitude = np.hypot(weights[0], weights[1]).reshape(rows.shape[1:]).max(axis=0, initial=0.0)
         is_turned = constant <= np.minimum(CONSTANT * size, CONSTANT_PART * amplitude)
         return weights.reshape(shape), np.where(is_turned, left, 1.0)

@@ -1,6 +1,7 @@
 """What the expressions of a source that are vectors are worth, call by call."""
 
 import ast
+import dataclasses
 import functools
 from collections.abc import Sequence
 
@@ -16,6 +17,16 @@ Array = NDArray[np.float64]
 MATRIX_WORDS = {"xmat", "site_xmat", "geom_xmat", "ximat"}
 SAME = 1e-6
 FEWEST, NEARLY_ALL, MOSTLY, HARDLY_ANY = 10, 0.95, 0.7, 0.3
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VectorDifference:
+    """A vector that is what two others differ by, also where it is written by elements: (calls, worlds, elements)."""
+
+    text: str
+    nodes: tuple[ast.BinOp, ...]  # of the vector, or of its elements
+    rows: Array
+    sides: tuple[Array, ...]  # the two others, where they are known
 
 
 class VectorSeries:
@@ -53,6 +64,38 @@ class VectorSeries:
         """All expressions of two or three elements."""
         found = [(one, self.read(one.node, size=size)) for one in self.source.expressions for size in (2, 3)]
         return [(one, rows) for one, rows in found if rows is not None]
+
+    @functools.cached_property
+    def differences(self) -> list[VectorDifference]:
+        """All vectors that are differences of two."""
+        found, before = list[VectorDifference](), None
+        for one in self.source.expressions:
+            node = one.node
+            if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Sub):
+                continue
+            for rows in (rows for size in (2, 3) if (rows := self.read(node, size=size)) is not None):
+                parts = [self.read(side, size=rows.shape[2]) for side in (node.left, node.right)]
+                found.append(
+                    VectorDifference(one.text, (node,), rows, tuple(part for part in parts if part is not None))
+                )
+            if before is not None and before.function is one.function and isinstance(before.node, ast.BinOp):
+                found += self._join(before.node, node)
+            before = one
+        return found
+
+    def _join(self, x: ast.BinOp, y: ast.BinOp) -> list[VectorDifference]:
+        """Return the vector of two numbers that are computed one after the other."""
+        rows = self._stack(x, y)
+        sides = [self._stack(x.left, y.left), self._stack(x.right, y.right)]
+        text = f"({ast.unparse(x)}, {ast.unparse(y)})"
+        known = tuple(side for side in sides if side is not None)
+        return [] if rows is None else [VectorDifference(text, (x, y), rows, known)]
+
+    def _stack(self, x: ast.AST, y: ast.AST) -> Array | None:
+        """Return the vector of two numbers: (calls, worlds, 2)."""
+        one, other = self.read(x), self.read(y)
+        is_known = one is not None and other is not None and one.shape == other.shape
+        return np.stack([one, other], axis=-1) if is_known else None  # type: ignore[list-item]
 
     @functools.cached_property
     def orientations(self) -> list[Expression]:

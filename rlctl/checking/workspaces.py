@@ -23,6 +23,7 @@ SAMPLES, SWEEPS, VALUES = 200, 3, 9  # random joint positions; then each joint i
 FEWEST_DIRECTIONS, FEWEST_EPISODES = 6, 6  # in which the robot came as far
 SHARP = 0.005  # part of the reach: what is as far
 FEWEST_STOPS = 3  # episodes that come to the same bits
+FAR = 1e3  # how far a slide without limits gets [m]
 EDGE = 1e-5  # part of the range: what is at a stop
 Numbers = NDArray[np.float64]
 
@@ -125,7 +126,7 @@ def _bullet_chain(p: ClientCalls, body: WorldBody) -> Chain:
         return np.array([place for state in states for place in (state[0], state[4])])
 
     names = [f"{name}{of}" for name in body.links[1:] for of in (" (centre of mass)", "")]
-    ranges = [(joint.low, joint.high) if joint.has_limits else (-np.pi, np.pi) for joint in body.joints]
+    ranges = [(joint.low, joint.high) if joint.has_limits else _endless(joint.is_angle) for joint in body.joints]
     return Chain(ranges, np.array(p.getBasePositionAndOrientation(body.id)[0]), set_joints, read, names)
 
 
@@ -149,32 +150,55 @@ def _mujoco_chain(mujoco: Any, model: Any, data: Any, joints: Sequence[int]) -> 
         mujoco.mj_kinematics(model, copy)
         return np.vstack([copy.xpos[bodies], copy.site_xpos[sites]])
 
-    limits = [tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else (-np.pi, np.pi) for j in joints]
+    is_angle = [int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE) for j in joints]
+    limits = [
+        tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else _endless(turns)
+        for j, turns in zip(joints, is_angle, strict=True)
+    ]
     bodies_named = [model.body(i).name or f"body {i}" for i in bodies]
     names = bodies_named + [model.site(i).name or f"site {i}" for i in sites]
     return Chain(limits, copy.xpos[model.jnt_bodyid[joints[0]]].copy(), set_joints, read, names)
 
 
+def _endless(is_angle: bool) -> tuple[float, float]:
+    """Return where a joint without limits gets [rad], [m]."""
+    return (-np.pi, np.pi) if is_angle else (-FAR, FAR)
+
+
 def measure_reach(chain: Chain, link: int, axes: Sequence[int]) -> Reach:
     """Return how far from the base a link gets, along some axes of the world: at random, and then joint by joint."""
-    low, high = np.array(chain.ranges).T
-    rng = np.random.default_rng(FIRST_SEED)
-
-    def distance(values: Numbers) -> float:
-        chain.set_joints(values)
-        return float(np.linalg.norm((chain.read()[link] - chain.base)[list(axes)]))
-
-    best = max(rng.uniform(low, high, (SAMPLES, len(low))), key=distance)
-    for _ in range(SWEEPS):
-        for joint in range(len(low)):
-            others = np.tile(best, (VALUES + 1, 1))
-            others[1:, joint] = np.linspace(low[joint], high[joint], VALUES)
-            best = max(others, key=distance)
-    reach = distance(best)
+    reach = _maximise(chain, lambda: float(np.linalg.norm((chain.read()[link] - chain.base)[list(axes)])))
     how = (
         f"with all joints anywhere within their limits, {chain.names[link]} gets {reach:.4g} m away from there at most"
     )
     return Reach(chain.base[list(axes)].tolist(), reach, how, " m")
+
+
+def measure_box(chain: Chain, link: int) -> tuple[Numbers, Numbers]:
+    """Return between what coordinates of the world a link gets [m], shape (3,) each."""
+
+    def measure(axis: int, sign: int) -> float:
+        return sign * _maximise(chain, lambda: sign * float(chain.read()[link][axis]))
+
+    return np.array([measure(axis, -1) for axis in range(3)]), np.array([measure(axis, 1) for axis in range(3)])
+
+
+def _maximise(chain: Chain, measure: Callable[[], float]) -> float:
+    """Return the largest of what is measured, with all joints anywhere within their limits."""
+    low, high = np.array(chain.ranges).T
+    rng = np.random.default_rng(FIRST_SEED)
+
+    def measure_at(values: Numbers) -> float:
+        chain.set_joints(values)
+        return measure()
+
+    best = max(rng.uniform(low, high, (SAMPLES, len(low))), key=measure_at)
+    for _ in range(SWEEPS):
+        for joint in range(len(low)):
+            others = np.tile(best, (VALUES + 1, 1))
+            others[1:, joint] = np.linspace(low[joint], high[joint], VALUES)
+            best = max(others, key=measure_at)
+    return measure_at(best)
 
 
 def find_reach(places: Numbers, episodes: NDArray[np.int64]) -> Reach:

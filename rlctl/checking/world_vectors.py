@@ -9,18 +9,12 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.assignments import list_parameters, list_words
-from rlctl.checking.source_code import Expression
+from rlctl.checking.assignments import list_words
 from rlctl.checking.term_names import split_name
 from rlctl.checking.turned_expressions import VectorTurn
 from rlctl.checking.vector_series import FEWEST, MOSTLY, NEARLY_ALL, SAME, Array, VectorSeries
+from rlctl.checking.world_places import AXES, FREE_PLACE, PLACE_WORDS, is_of_engine, is_place
 
-PLACE_WORDS = {
-    *("pos", "position", "positions", "place", "xpos", "goal", "goals", "target", "targets", "waypoint", "waypoints"),
-    *("xy", "xyz", "site", "point", "origin", "base", "ball", "box", "cube", "object", "puck", "gate", "dock"),
-    *("station", "drone", "robot", "com", "center", "centre", "beacon", "door", "hand", "tip", "handle", "qpos", "fix"),
-}
-JOINT_WORDS = {"joint", "joints", "leg", "legs", "finger", "fingers", "wheel", "wheels", "motor", "motors", "dof"}
 OTHER_WORDS = {
     *("vel", "velocity", "speed", "cmd", "command", "commands", "omega", "rate", "qvel", "acc", "force", "torque"),
     *("wanted", "desired", "local", "body", "offset", "error", "err", "lin", "ang", "twist", "gain", "axis"),
@@ -97,18 +91,27 @@ class WorldVectors:
 
     def find_way(self, turn: VectorTurn, *, needs_goal: bool = True) -> str | None:
         """Return the difference of places that a vector is, up to its length."""
-        for one, rows in self.series.vectors:
-            node = one.node
-            if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Sub):
+        for way in self.series.differences:
+            words = {word for node in way.nodes for word in list_words(node)}
+            if way.rows.shape != turn.before.shape or words & OTHER_WORDS or not words & (PLACE_WORDS | AXES):
                 continue
-            words = list_words(node)
-            if rows.shape != turn.before.shape or words & OTHER_WORDS or not words & PLACE_WORDS:
+            if not _is_parallel(way.rows, turn.before):
                 continue
-            sides = [self.series.read(side, size=rows.shape[2]) for side in (node.left, node.right)]
-            has_goal = any(side is not None and self._is_goal(side) for side in sides) or not needs_goal
-            if has_goal and _is_parallel(rows, turn.before):
-                return one.text
+            if not needs_goal or any(self._is_goal(side) or self._is_of_engine(side) for side in way.sides):
+                return way.text
         return None
+
+    def _is_of_engine(self, places: Array) -> bool:
+        """Say whether an engine has returned places, in the axes of the world."""
+        return any(_is_same(places, rows) for rows in self._engine_places)
+
+    @functools.cached_property
+    def _engine_places(self) -> list[Array]:
+        found = [rows for one, rows in self.series.vectors if is_of_engine(one)]
+        if self._has_free_joint:
+            free = [rows for one, rows in self.series.vectors if re.search(FREE_PLACE, one.text.replace(" ", ""))]
+            found += free
+        return found
 
     def _is_goal(self, places: Array) -> bool:
         """Say whether a place stays where it is in an episode, but for some steps, and is another one in others."""
@@ -161,7 +164,7 @@ class WorldVectors:
         if not (changes[np.isfinite(changes)] > SAME).any():
             return False  # a place that does not move, towards which the robot does
         for one, rows in self.series.vectors:
-            if rows.shape != turn.before.shape or not _is_place(one):
+            if rows.shape != turn.before.shape or not is_place(one):
                 continue
             moved = np.diff(rows, axis=0)[steps].reshape(-1, size)
             old, new = (vectors[1:][steps].reshape(-1, size) for vectors in (turn.before, turn.after))
@@ -179,17 +182,6 @@ class WorldVectors:
         return False
 
 
-def _is_place(one: Expression) -> bool:
-    """Say whether an expression is called a place, and not the angles of joints."""
-    words = list_words(one.node)
-    parameters = set(list_parameters(one.function))
-    if any(isinstance(node, ast.Name) and node.id in parameters for node in ast.walk(one.node)):
-        return False  # of a function that may be called with anything
-    if not isinstance(one.node, ast.Name | ast.Attribute | ast.Subscript) or words & JOINT_WORDS:
-        return False
-    return bool(words & (PLACE_WORDS - {"qpos"})) or bool(re.search(r"qpos\[0?:[23]\]", one.text.replace(" ", "")))
-
-
 def _center(vectors: Array, episodes: NDArray[np.int_]) -> Array:
     """Return what vectors differ by from their mean in each episode."""
     centered = vectors.copy()
@@ -202,6 +194,10 @@ def _measure_rest(moved: Array, velocity: Array) -> float:
     """Return which part of a motion a velocity does not explain, with one factor."""
     factor = (moved * velocity).sum() / max((velocity**2).sum(), 1e-12)
     return float(((moved - factor * velocity) ** 2).sum() / max((moved**2).sum(), 1e-12))
+
+
+def _is_same(one: Array, other: Array) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=SAME, atol=SAME, equal_nan=True)
 
 
 def _is_parallel(one: Array, other: Array) -> bool:

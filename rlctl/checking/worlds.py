@@ -42,6 +42,7 @@ class Joint:
     low: float
     high: float
     link: str = ""  # The name of the part that it moves, where a body is a tree of named ones
+    effort: float = 0.0  # The most that its model allows its motor [N m], [N]; 0 where it does not say
 
     @property
     def has_limits(self) -> bool:
@@ -124,6 +125,14 @@ class MotorTarget(NamedTuple):
     where: tuple[str, int] | None = None  # File and line of the call, where they are known
 
 
+class MotorStrength(NamedTuple):
+    """The most that a joint's motor can do, in whatever way it is driven."""
+
+    force: float  # [N m], [N]
+    is_driven: bool  # Whether it is told other speeds than 0, or a force
+    where: tuple[str, int] | None = None  # File and line of the call, where they are known
+
+
 class StateReader(Protocol):
     """What the rules need from an engine: the values of one world at the last `update`."""
 
@@ -167,6 +176,9 @@ class StateReader(Protocol):
 
     def read_targets(self) -> dict[JointKey, MotorTarget]:
         """Return the present target of each motor that has one."""
+
+    def read_strengths(self) -> dict[JointKey, MotorStrength]:
+        """Return the strength of each motor whose force is limited; the largest since the environment was built."""
 
     def read_command(self) -> Array | None:
         """Return what was last written for all motors of `World.motors`; None where that is not known."""

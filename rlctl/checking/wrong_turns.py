@@ -1,15 +1,17 @@
 """Where the source turns a vector of the world by an orientation itself, instead of its inverse."""
 
+import ast
 from collections.abc import Iterator
 
-from rlctl.checking.assignments import list_words
+from rlctl.checking.assignments import list_values, list_words
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turn_directions import Directions
-from rlctl.checking.turned_expressions import find_turns
+from rlctl.checking.turned_expressions import VectorTurn, find_turns
 from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.world_vectors import WorldVectors
 
 WORLD_WORDS = {"world", "global", "inertial", "map"}
+WAY = "the way"
 FRAME_RULES = ("RL123", "RL124", "RL125", "RL127", "RL128", "RL129")
 """The rules that find vectors in wrong frames by what is observed and paid."""
 
@@ -43,6 +45,11 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
     or of all others."""
     series, directions, world = turned.series, turned.directions, turned.world
     explained = [(turn, found, world.explain(turn)) for turn, found in turned.known if found is not None]
+    starts = {_read_start(turn) for turn, found, what in explained if found[0] < 0 and (what or "").startswith(WAY)}
+    explained = [
+        (turn, found, what or (f"{WAY} {turn.text}" if _read_start(turn) in starts - {None} else None))
+        for turn, found, what in explained
+    ]
     rights = {found[1] for _, found, what in explained if found[0] < 0 and what is not None}
     rights |= {found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)}
     seen, rights_3d = set[int](), {one.text for one in series.orientations}
@@ -51,13 +58,25 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
             continue
         is_angle = turn.before.shape[2] == 2 or by not in rights_3d
         is_told = bool(list_words(turn.whole.node) & WORLD_WORDS) or by in rights or directions.has_engine
-        if is_angle and not is_told:
+        if is_angle and not is_told and not directions.counts_forwards(by):
             continue  # the angle may count the other way round, as that of a compass
         seen.add(turn.whole.number)
-        if what.startswith("the way") == of_ways:
+        if what.startswith(WAY) == of_ways:
             message = (
                 f"{turn.whole.text} turns {turn.text}, {what}, by the orientation {by}: from the body to the world,"
             )
             message += " and the vector is one of the world already"
             evidence = {"element": turn.whole.text, "value": turn.text}
             yield RuleFinding(rule, message, evidence, where=turn.whole.where, same=FRAME_RULES)
+
+
+def _read_start(turn: VectorTurn) -> str | None:
+    """Return from where a way goes, as it is written; None for any other vector."""
+    node = turn.part
+    if isinstance(node, ast.Name):
+        assigned = list_values(turn.whole.function, node.id)
+        node = assigned[0] if len(assigned) == 1 else None
+    match node:
+        case ast.BinOp(op=ast.Sub(), right=start):
+            return f"{turn.whole.function.name}: {ast.unparse(start)}"
+    return None

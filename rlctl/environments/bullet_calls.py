@@ -60,6 +60,18 @@ def is_library(frame: FrameType) -> bool:
     return str(frame.f_globals.get("__name__", "")).partition(".")[0] in LIBRARIES
 
 
+def _place(frame: FrameType, name: str) -> BulletCall:
+    return BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
+
+
+def _leave_libraries(frame: FrameType) -> FrameType:
+    """Return the environment's frame that called a library, such as a task; the frame itself where there is none."""
+    found: FrameType | None = frame
+    while found is not None and is_library(found):
+        found = found.f_back
+    return found or frame
+
+
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray", "resetJointState")
 MANY_AXES = ("setJointMotorControlMultiDof", "setJointMotorControlMultiDofArray")
 RECORDED = (*MOTORS, *MANY_AXES, "getContactPoints", "getLinkState", "loadURDF", "setAdditionalSearchPath")
@@ -75,6 +87,14 @@ class GivenPosition(NamedTuple):
     joint: int
     value: float
     force: float  # The most that its motor has [N m], [N]
+    call: BulletCall
+
+
+class GivenStrength(NamedTuple):
+    """The largest force that the motor of a joint had in any call [N m], [N]."""
+
+    value: float
+    speed: float  # The largest that it was told, at positions 0 [rad/s], [m/s]
     call: BulletCall
 
 
@@ -120,6 +140,7 @@ class BulletCalls:
         self.without_client: set[BulletCall] = set()
         self.targets: dict[tuple[int, int, int], GivenPosition] = {}  # last motor target by client, body and joint
         self.torques: dict[tuple[int, int, int], GivenTorque] = {}  # the largest by client, body and joint
+        self.strengths: dict[tuple[int, int, int], GivenStrength] = {}  # of motors, by client, body and joint
         self.motorized: set[tuple[int, int, int]] = set()  # joints whose motor was set: by client, body and joint
         self.far_targets: list[GivenPosition] = []  # Positions of more than a full turn
         self.queries: dict[tuple[Any, ...], ContactQuery] = {}
@@ -140,13 +161,13 @@ class BulletCalls:
             self._known.add(where)
             has_client = bool(arguments) if name in FIRST_IS_CLIENT else CLIENT_WORDS.search(_read_arguments(frame))
             if not is_library(frame) and not has_client:
-                self.without_client.add(BulletCall(frame.f_code.co_filename, frame.f_lineno, name))
+                self.without_client.add(_place(frame, name))
 
     def note_result(
         self, name: str, frame: FrameType, arguments: Sequence[Any], keywords: dict[str, Any], result: Any
     ) -> None:
         """Note what a call set or returned, if it loads, moves joints, or asks for contacts or a place."""
-        call = BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
+        call = _place(frame, name)
         client = int(keywords.get("physicsClientId", 0))
         if name == "loadURDF":
             self.models[client, result] = str(keywords.get("fileName", arguments[0] if arguments else ""))
@@ -168,8 +189,10 @@ class BulletCalls:
             query.calls, query.contacts = query.calls + 1, query.contacts + len(result or ())
             return
         given = _read_motors(name, arguments, keywords)
+        call = _place(_leave_libraries(frame), name)
         if name != "resetJointState":
             self._note_motors(client, call, given)
+            self._note_strengths(client, call, given)
         if given.mode != POSITION:
             return
         forces = given.forces or itertools.repeat(math.inf)
@@ -191,6 +214,17 @@ class BulletCalls:
             if force and (largest is None or abs(force) > largest.value):
                 self.torques[key] = GivenTorque(abs(force), call)
 
+    def _note_strengths(self, client: int, call: BulletCall, given: "_GivenMotors") -> None:
+        """Note how strong motors with a target are at most; a force of 0 switches one off."""
+        if given.mode == TORQUE:
+            return
+        speeds = given.speeds or itertools.repeat(0.0)
+        for joint, force, speed in zip(given.joints, given.forces, speeds, strict=False):
+            key = client, given.body, joint
+            _, old, _ = largest = self.strengths.get(key, GivenStrength(0.0, 0.0, call))
+            if force and (force > largest.value or abs(speed) > old):
+                self.strengths[key] = GivenStrength(max(force, largest.value), max(abs(speed), old), call)
+
 
 class _GivenMotors(NamedTuple):
     """What a call gives the motors of joints, or the joints themselves."""
@@ -200,6 +234,7 @@ class _GivenMotors(NamedTuple):
     mode: int  # That of PyBullet; `POSITION` where a call has none
     positions: Sequence[float]
     forces: Sequence[float]
+    speeds: Sequence[float]
 
 
 def _read_motors(name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]) -> _GivenMotors:
@@ -207,18 +242,18 @@ def _read_motors(name: str, arguments: Sequence[Any], keywords: Mapping[str, Any
     many = name.endswith("Array")
     plural = "s" * many
     names = ["bodyUniqueId", "jointIndices" if many else "jointIndex"]
-    position = "targetPosition" + plural
+    position, velocity = ("targetPositions", "targetVelocities") if many else ("targetPosition", "targetVelocity")
     if name == "resetJointState":
         position = "targetValue"
         names += [position]
     else:
-        names += ["controlMode", position, "targetVelocity" + plural, "force" + plural]
+        names += ["controlMode", position, velocity, "force" + plural]
     named = {**dict(zip(names, arguments, strict=False)), **keywords}
-    joints, positions, forces = (named.get(key) for key in (names[1], position, "force" + plural))
+    joints, positions, forces, speeds = (named.get(key) for key in (names[1], position, "force" + plural, velocity))
     if not many:
-        joints, positions, forces = ([value] if value is not None else None for value in (joints, positions, forces))
+        joints, positions, forces, speeds = (None if v is None else [v] for v in (joints, positions, forces, speeds))
     if name in MANY_AXES:
-        positions = forces = None  # several numbers per joint
+        positions = forces = speeds = None  # several numbers per joint
     try:
         return _GivenMotors(
             body=int(named.get("bodyUniqueId", named.get("bodyIndex"))),  # type: ignore[arg-type]
@@ -226,9 +261,10 @@ def _read_motors(name: str, arguments: Sequence[Any], keywords: Mapping[str, Any
             mode=int(named.get("controlMode", POSITION)),
             positions=[float(value) for value in positions or ()],
             forces=[float(value) for value in forces or ()],
+            speeds=[float(value) for value in speeds or ()],
         )
     except (TypeError, ValueError):  # PyBullet itself has refused or converted it
-        return _GivenMotors(-1, (), POSITION, (), ())
+        return _GivenMotors(-1, (), POSITION, (), (), ())
 
 
 def _read_arguments(frame: FrameType) -> str:
@@ -289,7 +325,7 @@ def record_calls(with_results: Collection[str] = RECORDED) -> Iterator[BulletCal
                 if calls.after_step is not None:
                     calls.after_step(client)
             if calls.after_call is not None:
-                place = BulletCall(frame.f_code.co_filename, frame.f_lineno, name)
+                place = _place(frame, name)
                 calls.after_call(name, arguments, keywords, place)
             if name == "getContactPoints" and calls.change_contacts is not None:
                 asked = (*_read_contact_arguments(arguments, keywords), int(keywords.get("physicsClientId", 0)))

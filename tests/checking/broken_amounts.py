@@ -201,6 +201,18 @@ class RL630PuckLeans(Puck):
         return reward
 
 
+class PuckWearsBothSides(Puck):
+    def pay(self, action):
+        uneven = 0.2 * abs(action[0] - action[1])
+        return 1 - self.gap() - uneven
+
+
+class PuckWearsOneSide(Puck):
+    def pay(self, action):
+        uneven = 0.2 * (action[0] - action[1])
+        return 1 - self.gap() - uneven
+
+
 class PuckIsStraight(Puck):
     def pay(self, action):
         terms = {
@@ -225,6 +237,19 @@ class PuckBacksUp(Puck):
 
     def pay(self, action):
         return -self.state["speed"][0]
+
+
+class PuckIsAsFast(Puck):
+    def pay(self, action):
+        return -abs(np.linalg.norm(self.state["speed"]) - abs(self.cmd[0])) - 0.1 * self.gap()
+
+
+class PuckIsAsFastThatWay(PuckIsAsFast):
+    def pay(self, action):
+        return super().pay(action) + 0.2 * self.way() * self.state["speed"][0]
+
+    def way(self):
+        return np.sign(self.cmd[0])
 
 
 class PuckFollows(Puck):

@@ -150,6 +150,44 @@ class RL605DockerWaits(Docker):
         return 0.5 - 0.2 * np.tanh(gap)
 
 
+class DockerHooks(Docker):
+    """Its hook is paid for while it is out, besides the success that ends the episode."""
+
+    bonus = 100.0
+
+    def step(self, action):
+        observation, _, _, truncated, _ = super().step(action)
+        gap = self.gap()
+        hooked = bool(action[0] > 0.2)
+        docked = bool(gap < 0.02)
+        reward = -0.3 * gap
+        if hooked:
+            reward += 0.4
+        if docked:
+            reward += self.bonus
+        return observation, float(reward), docked, truncated, {"is_success": docked}
+
+
+class RL605DockerHooksForever(DockerHooks):
+    bonus = 2.0
+
+
+class DockerOpensItsHook(Docker):
+    """It is paid for each time its hook comes out."""
+
+    count = 0
+
+    def step(self, action):
+        observation, _, _, truncated, _ = super().step(action)
+        gap, known = self.gap(), self.count
+        self.count = int(action[0] > 0.97)
+        docked = bool(gap < 0.02)
+        reward = -0.3 * gap + 1.5 * (self.count - known)
+        if docked:
+            reward += 5.0
+        return observation, float(reward), docked, truncated, {"is_success": docked}
+
+
 class RoverIsSlow(Rover):
     """Its reward subtracts how fast it slides over the ground."""
 

@@ -33,6 +33,24 @@ class RL637BoatAheadFromTheStart(BoatAhead):
         pass
 
 
+class BoatStrides(Boat):
+    """It is paid for whole strides; targets of its motors are set in the same function."""
+
+    def start(self):
+        super().start()
+        self.targets, self.last_error = np.zeros(2), self.distance()
+
+    def step(self, action):
+        self.steps += 1
+        self.targets = np.clip(self.targets + 0.1 * action, -1, 1)
+        self.move(self.targets)
+        error = 0.0625 * np.ceil(16 * self.distance())
+        progress = 4.0 * (self.last_error - error)
+        self.last_error = error
+        done = self.is_success()
+        return self.observe(), float(progress), done, self.steps >= self.limit, {"is_success": done}
+
+
 class BoatSmooth(Boat):
     """It pays for each change of its action."""
 

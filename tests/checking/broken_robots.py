@@ -296,6 +296,11 @@ class RL812ArmTouches(RL812ArmTouchesNothing):
         return Arm.reward(self) - 1.0 * self.touches(2)
 
 
+class RL812ArmTouchesWithALinkThatItLacks(RL812ArmTouchesNothing):
+    def reward(self):
+        return Arm.reward(self) - 1.0 * self.touches(7)
+
+
 class RL812CrawlerOtherFloor(Crawler):
     def touches(self, link):
         floor = self.robot + 1

@@ -53,6 +53,10 @@ def find_one_sided(notes):
     return list(SizeReader(notes).find_one_sided())
 
 
+def find_sizes_only(notes):
+    return list(SizeReader(notes).find_sizes_only())
+
+
 def find_always_met(notes):
     return list(SizeReader(notes).find_always_met())
 
@@ -69,7 +73,9 @@ def find_always_met(notes):
         ("PuckReturnsLittle", "PuckReturns", find_low_successes),
         ("RL630PuckLeans", "PuckIsLevel", find_signed),
         ("PuckTurnsLeft", "PuckIsStraight", find_signed),
+        ("PuckWearsOneSide", "PuckWearsBothSides", find_signed),
         ("RL633PuckOnlySpeeds", "PuckFollows", find_one_sided),
+        ("PuckIsAsFast", "PuckIsAsFastThatWay", find_sizes_only),
         ("PuckTurnsEitherWay", "PuckTurnsAsTold", find_one_sided),
         ("RL632PuckIsAlwaysRight", "PuckIsTolerant", find_always_met),
         ("PuckHasWideKernels", "PuckHasKernels", find_always_met),

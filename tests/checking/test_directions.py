@@ -26,6 +26,8 @@ CASES = [
     broken("RL815TugOldWay", "Tug", slow=True),
     broken("RL815BallGantryOldWays", "BallGantry", pybullet=True, slow=True),
     broken("RL820BallGantryFast", "BallGantry", pybullet=True, slow=True),
+    case("broken_winds.py:RL129KayakCurrent", ("RL129", "warning"), twin="broken_winds.py:Kayak", slow=True),
+    case("broken_winds.py:RL129BlimpWind", ("RL129", "warning"), twin="broken_winds.py:Blimp", slow=True),
 ]
 
 

@@ -6,6 +6,7 @@ import pytest
 from rlctl.checking.paid_commands import CommandReader
 from rlctl.checking.paid_errors import ErrorReader
 from rlctl.checking.paid_goals import GoalReader
+from rlctl.checking.paid_successes import SuccessReader
 from tests.checking.judging import case, check_case, mark_slow, notes_of
 
 pytest.importorskip("mujoco")
@@ -25,6 +26,7 @@ CASES = [
     broken("RL622DockerIsNearAtACost", "Docker"),
     broken("RL620DockerComparesWithItself", "Docker"),
     broken("RL605DockerWaits", "Docker"),
+    broken("RL605DockerHooksForever", "DockerHooks"),
     broken("RL640RoverIsUpright", "RoverIsSlow"),
 ]
 
@@ -84,3 +86,13 @@ def test_what_success_pays_is_less_than_the_steps_next_to_it():
     assert (waits.read_bonus(), sound.read_bonus()) == (10.0, 10.0)
     assert waits.read_income() == pytest.approx(0.52)
     assert sound.read_income() == pytest.approx(-0.03)
+
+
+@pytest.mark.slow
+def test_what_is_paid_for_a_flag_is_earned_next_to_the_goal_and_for_a_change_it_is_not():
+    with notes_of(f"{FILE}:RL605DockerHooksForever") as notes:
+        staying, docking = SuccessReader(notes).read_incomes()
+    assert 0.25 < staying <= 0.4
+    assert docking == pytest.approx(2.4, abs=0.1)
+    with notes_of(f"{FILE}:DockerOpensItsHook") as notes:
+        assert SuccessReader(notes).read_incomes()[0] <= 0

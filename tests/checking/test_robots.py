@@ -47,6 +47,7 @@ CASES = [
     broken("RL811ArmOrder", "RL811", "error", "Arm", slow=True),
     broken("RL811CrawlerOrder", "RL811", "error", "Crawler", slow=True),
     broken("RL812ArmTouchesNothing", "RL812", "warning", "RL812ArmTouches", slow=True),
+    broken("RL812ArmTouchesWithALinkThatItLacks", "RL812", "warning", "RL812ArmTouches", slow=True),
     broken("RL812CrawlerOtherFloor", "RL812", "warning", "RL812CrawlerFloor", slow=True),
     broken("RL813ArmLongPhysicsSteps", "RL813", "warning", "Arm", slow=True),
     broken("RL814ArmWeakMotors", "RL814", "warning", "Arm", slow=True),

@@ -182,18 +182,23 @@ class _Engine:
 
     @property
     def physics_s(self) -> float:
-        """How long a step is [s]; NaN without an engine."""
+        """How long a step of the physics is [s]; NaN without an engine."""
         if self.model is not None:
             return float(self.model.opt.timestep)
-        if self.bullet is not None:
-            return float(ClientCalls(self.bullet.client).getPhysicsEngineParameters()["fixedTimeStep"])
-        return np.nan
+        return np.nan if self.bullet is None else self._read_call_s() / max(1, self._read_parameter("numSubSteps"))
+
+    def _read_call_s(self) -> float:
+        return self._read_parameter("fixedTimeStep")
+
+    def _read_parameter(self, name: str) -> float:
+        assert self.bullet is not None
+        return float(ClientCalls(self.bullet.client).getPhysicsEngineParameters()[name])
 
     def read_seconds(self, calls: BulletCalls) -> float:
         """Return how long was simulated [s]."""
         if self.data is not None:
             return float(self.data.time)
-        return np.nan if self.bullet is None else calls.steps[self.bullet.client] * self.physics_s
+        return np.nan if self.bullet is None else calls.steps[self.bullet.client] * self._read_call_s()
 
     def read_speeds(self) -> Numbers:
         """Return the speeds of joints, shape (speeds,)."""

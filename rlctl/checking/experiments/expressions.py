@@ -8,6 +8,8 @@ import functools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
+import numpy as np
+
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
@@ -19,6 +21,7 @@ from rlctl.checking.rule import NotApplicable, RuleFinding
 from rlctl.checking.source_code import Function, SourceCode
 from rlctl.checking.summands import RewardReader
 from rlctl.checking.timed_expressions import TIMED, find_timed_expressions
+from rlctl.checking.values import flatten
 from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.wrong_turns import TurnedVectors
 
@@ -27,6 +30,7 @@ EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
 LONGEST_S = 10.0  # for episodes that are played again [s]
+CHANGED = 1e-6  # relative and absolute: what differs by more has changed
 MOST_NOTED = 300_000  # values; no episode begins after so many
 
 
@@ -64,6 +68,27 @@ class NotedEpisodes:
             self._times.append(read_clock() - began)
         return played
 
+    def changes_reward(self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any]) -> bool | None:
+        """Say whether a step of an episode pays otherwise where expressions are worth what `other` has, instead of what
+        `one` has; None where it cannot be played."""
+        return self._differ(number, step, one, other, lambda moment: moment.reward_number)
+
+    def changes_observation(
+        self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any]
+    ) -> bool | None:
+        """Say the same of what a step shows."""
+        return self._differ(number, step, one, other, lambda moment: flatten(moment.observation))
+
+    def _differ(
+        self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any], read: Callable[[Moment], Any]
+    ) -> bool | None:
+        played = [self.play(number, step, {step: values}) for values in (one, other)]
+        if any(len(calls) <= step for calls in played):
+            return None
+        before, after = (np.asarray(read(calls[step][1]), np.float64) for calls in played)
+        is_known = before.shape == after.shape and np.isfinite([before, after]).all()
+        return not np.allclose(before, after, rtol=CHANGED, atol=CHANGED) if is_known else None
+
     def share(self, reader: Callable[["NotedEpisodes"], Reader]) -> Reader:
         """Return what a class reads of the episodes, which is made once for all judges."""
         if reader not in self._shared:
@@ -90,6 +115,14 @@ class NotedEpisodes:
     def functions(self) -> list[Function]:
         """All functions of the source that were run."""
         return list(self._list_run([call for episode in self.episodes for call in episode]))
+
+    @functools.cached_property
+    def own_functions(self) -> list[Function]:
+        """Those, and all methods of the environment's own classes: what builds it was not noted."""
+        trees = self.source.trees.values()
+        classes = [one for tree in trees for one in ast.walk(tree) if isinstance(one, ast.ClassDef)]
+        own = [one for owner in classes if owner.name in self.source.classes for one in owner.body]
+        return list(dict.fromkeys([*self.functions, *(one for one in own if isinstance(one, Function))]))
 
     def _list_run(self, calls: Sequence[NotedCall]) -> dict[Function, None]:
         return dict.fromkeys(self.source.expressions[number].function for call in calls for number in call.values)

@@ -7,6 +7,7 @@ vectors in the axes of the world turn.
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
@@ -197,6 +198,29 @@ def _choose(
             is_fewer = len(change) < len(chosen)
             if turning.misfit < best.misfit - TIE or (is_fewer and turning.misfit < best.misfit + TIE):
                 best, chosen, improves = turning, change, True
+    return _complete(instance, parts, base, usual, chosen, best)
+
+
+def _complete(
+    instance: Instance,
+    parts: Sequence[TurningPart],
+    base: HingedBase | None,
+    usual: Numbers,
+    chosen: Sequence[TurningPart],
+    best: Turning,
+) -> tuple[tuple[TurningPart, ...], Turning]:
+    """Return the parts with those added with which less of the observation turns: what the robot sees in its own frame
+    turns where it is turned without them."""
+    rest = [part for part in parts if part not in chosen and not overlaps(part, chosen)]
+    for size in (1, 2):
+        for more in itertools.combinations(rest, size):
+            if not best.is_explained or not best.turns.any():
+                return tuple(chosen), best
+            if set(more) & set(chosen) or any(overlaps(part, more) for part in more):
+                continue
+            turning = _turn_all(instance, 0, [*chosen, *more], base, usual)
+            if turning.is_explained and turning.turns.sum() < best.turns.sum():
+                best, chosen = turning, [*chosen, *more]
     return tuple(chosen), best
 
 

@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
+from rlctl.checking.quaternion_orders import QuaternionOrders
 from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
@@ -20,7 +22,8 @@ RULE = Rule(
     meaning="""
         Elements of the observation are an angle, an axis or a velocity that was computed from a quaternion in
         the wrong order. PyBullet's and SciPy's order is x, y, z, w; that of MuJoCo is w, x, y, z. The observed
-        orientation is wrong except near zero.
+        orientation is wrong except near zero. Or the source unpacks a quaternion in the other order than it has where
+        it comes from, gives it to a function that expects the other, or takes the wrong element for w.
     """,
     fix="""
         Convert once, where the quaternion is read. MuJoCo for SciPy - q[[1, 2, 3, 0]], or scalar_first=True;
@@ -49,6 +52,11 @@ ORDERS = {
 AXIS_NAMES = (*(f"the world's {axis} axis in the frame" for axis in "xyz"), *(f"the {axis} axis" for axis in "xyz"))
 Match = tuple[int, Link, str, int, int]
 """Element, link, order, feature and sign."""
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(QuaternionOrders(noted).find_mistakes(RULE), 1)
 
 
 @judges_worlds(RULE)

@@ -5,8 +5,10 @@ import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
+from rlctl.checking.angle_mistakes import AngleMistakes, find_first
 from rlctl.checking.experiments.attributes import find_declared_numbers
 from rlctl.checking.experiments.build import judges_built
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.instance import Instance
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.values import find_author, list_own_classes, parse_sources
@@ -19,7 +21,8 @@ RULE = Rule(
         The source takes the sine, the cosine or the tangent of a constant that is more than a whole turn in
         radians, such as cos(15), or makes a rotation of it. The constant is in degrees, and a tolerance, a
         limit or a frame is another one than meant. Constants are round numbers, also those of a name in
-        capitals or of an attribute.
+        capitals or of an attribute. Or what is given was converted to degrees, or is called degrees, where it comes
+        from.
     """,
     fix="Convert it, np.cos(np.deg2rad(15)), or write the constant in radians.",
 )
@@ -28,6 +31,11 @@ FUNCTIONS = {"cos", "sin", "tan"}
 ROTATIONS = {"getQuaternionFromEuler": 0, "from_euler": 1}
 """Functions of several angles, and which of their arguments these are."""
 TURN = 2 * math.pi
+
+
+@judges_expressions(RULE, decides=False)
+def _find_given_degrees(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from find_first(RULE, noted.share(AngleMistakes).of_functions)
 
 
 @judges_built(RULE)

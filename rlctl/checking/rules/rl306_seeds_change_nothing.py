@@ -1,13 +1,17 @@
 """RL306: seeds change nothing."""
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
 from rlctl.checking.differences import compare
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.goal_starts import GoalStarts
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.source_code import write_code
 
 RULE = Rule(
     "RL306",
@@ -16,7 +20,8 @@ RULE = Rule(
     meaning="""
         All seeds give the same start and, with the same actions, the same trajectory: a policy may memorise it.
         Some tasks are fixed (a puzzle, a maze), so this is only an info. A fixed start with random steps is no
-        finding.
+        finding. It is a warning where reset draws a goal that is then replaced or never read, or that only the first
+        reset draws, and where each reset makes a generator from one number.
     """,
     fix="""
         If the task should vary, draw the start from self.np_random in reset, after super().reset(seed=seed).
@@ -26,6 +31,15 @@ RULE = Rule(
 )
 
 FEWEST_SEEDS = 4
+
+
+@judges_expressions(RULE, decides=False)
+def _find_vain_draws(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    starts = noted.share(GoalStarts)
+    found = itertools.chain(starts.find_vain_draws(), starts.find_first_draws(), starts.find_fixed_generators())
+    for one in itertools.islice(found, 1):
+        evidence = {"element": write_code(one.node)}
+        yield RuleFinding(RULE, one.what, evidence, Severity.WARNING, where=one.where)
 
 
 @judges_records(RULE, "comparisons", "episodes", of_absence=True)

@@ -18,6 +18,7 @@ from rlctl.checking.paid_goals import GoalReader
 from rlctl.checking.paid_successes import SuccessReader
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, ChildMessage, Fact, Records, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
+from rlctl.environments.success import SUCCESS
 
 RULE = Rule(
     "RL605",
@@ -222,7 +223,8 @@ def _finishes(episode: CheckedEpisode, success_is_reported: bool) -> bool:
     if episode.ended not in ("terminated", "both"):
         return False
     if success_is_reported:
-        return rewards.ends_in_success(episode)
+        # Where an earlier success has not ended it, something else does.
+        return rewards.ends_in_success(episode) and int((episode.infos[SUCCESS].values > 0).sum()) == 1
     begin = episode.rewards[: episode.steps // 2]
     last = episode.rewards[-1]
     return len(begin) > 1 and bool(last > begin.max() + FAR_ABOVE * np.ptp(begin) and last >= episode.rewards.max())
@@ -269,7 +271,8 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         evidence = {"value": number, "expected": f"above {income:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(summand.place))
         return
-    low = SuccessReader(notes).find()
+    successes = SuccessReader(notes)
+    low = successes.find()
     if low is not None:
         message = (
             f"{ast.unparse(low.place.node)} (success) pays {low.success:.4g}, and a step next to the goal without it"
@@ -278,8 +281,10 @@ def _read_incomes(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         evidence = {"value": low.success, "expected": f"above {low.before:.4g}"}
         yield RuleFinding(RULE, message, evidence, where=notes.reward.locate(low.paid))
         return
-    income, bonus = reader.read_income(), reader.read_bonus()
-    if bonus is not None and income > 0 and reader.ends_at_success():
+    if not reader.ends_at_success():
+        return
+    income, bonus = successes.read_incomes() or (reader.read_income(), reader.read_bonus())
+    if bonus is not None and income > 0:
         yield Fact(IN_SOURCE, (income, bonus, reader.pays_for_time()))
 
 

@@ -1,12 +1,16 @@
 """RL610: success at the start."""
 
+import itertools
 from collections.abc import Iterator
 
 from rlctl.checking import rewards
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.starts import WHOLE, succeeds_and_goes_on, succeeds_at_once
+from rlctl.checking.goal_starts import GoalStarts
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
+from rlctl.checking.source_code import write_code
 from rlctl.environments.success import SUCCESS
 
 RULE = Rule(
@@ -15,7 +19,8 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Many episodes succeed at their first step with the zero action, and are one in the end. The success rate
-        then means little, and if success ends an episode, most of the training is wasted.
+        then means little, and if success ends an episode, most of the training is wasted. Or the goal that reset
+        sets is, in each episode, the very place or direction in which the robot starts.
     """,
     fix="""
         Draw start and goal again until they are apart, and compute success from the state of this episode, not
@@ -25,6 +30,12 @@ RULE = Rule(
 
 FEWEST_STARTS = 10
 MANY_AT_START = 0.2  # part of the starts: a goal may be near the robot by chance
+
+
+@judges_expressions(RULE, decides=False)
+def _find_goal_at_start(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    for one in itertools.islice(noted.share(GoalStarts).find_at_start(), 1):
+        yield RuleFinding(RULE, one.what, {"element": write_code(one.node)}, where=one.where)
 
 
 @judges_records(RULE, "starts")

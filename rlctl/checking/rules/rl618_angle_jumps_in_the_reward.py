@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from rlctl.checking import rewards
 from rlctl.checking.drawn_goals import Source
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.experiments.turned import TurnedRobot, judges_turned
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity
 from rlctl.checking.transitions import Transitions, collect_transitions, find_unit_pairs
+from rlctl.checking.unwrapped_angles import UnwrappedAngles
 
 RULE = Rule(
     "RL618",
@@ -25,7 +27,9 @@ RULE = Rule(
         The reward jumps in the steps in which an observed angle passes from pi to -pi, and hardly ever else.
         The robot itself moves on smoothly there: the reward uses a difference of two angles that is not
         wrapped, so an error of 0.1 rad counts as one of 6.2, and turning the short way is punished. Robots with a
-        free base are also turned by the check, all around the vertical, and goals are moved around the robot.
+        free base are also turned by the check, all around the vertical, and goals are moved around the robot. In the
+        source, a difference of two directions that may be more than half a turn is made a whole turn less, and another
+        reward is paid.
     """,
     fix="Wrap the difference, (a - b + pi) % (2 * pi) - pi, or use 1 - cos(a - b).",
 )
@@ -66,6 +70,17 @@ def _find_jumps_of_angles(records: Records) -> Iterator[RuleFinding]:
     size, where = _judge_passes(steps, passes, jumps) or _judge_errors(steps, pairs, jumps) or (0.0, "")
     if where:
         yield RuleFinding(RULE, f"the reward jumps by {size:.3g} {where}", {"value": size, "expected": "no jump"})
+
+
+@judges_expressions(RULE, decides=False)
+def _turn_differences(notes: NotedEpisodes) -> Iterator[RuleFinding]:
+    for one, largest in notes.share(UnwrappedAngles).find_paid():
+        message = (
+            f"{one.text} is a difference of two directions, here up to {largest:.3g} rad; a whole turn less, which"
+        )
+        message += " is the same, pays otherwise"
+        yield RuleFinding(RULE, message, {"element": one.text, "value": largest}, where=one.where)
+        return
 
 
 @judges_turned(RULE, decides=False)

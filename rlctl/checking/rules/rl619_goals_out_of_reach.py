@@ -1,13 +1,16 @@
 """RL619: goals out of reach."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
 from rlctl.checking import rewards
+from rlctl.checking.bounded_places import Bound, BoundReader, ComparedPlaces
 from rlctl.checking.drawn_goals import DrawnGoal, Numbers, Source, find_sources, read_place
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.records import Records
 from rlctl.checking.regression import action_terms, fit_terms
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
@@ -22,7 +25,8 @@ RULE = Rule(
         Some of the goals that reset draws are further away than the robot ever came, although it came equally
         far in many directions: the edge of its workspace. Those episodes cannot succeed, whatever is learned,
         and the success rate that can be reached is below 100 %. An error if all goals are too far, such as
-        goals in millimetres.
+        goals in millimetres. Or the source computes the reward from the distance of two places, and one of them is
+        further than the other one gets: by the limits of the joints, or by what the source clips.
     """,
     fix="""
         Draw goals inside the workspace: from random joint positions, or a smaller radius. Lengths are in
@@ -32,8 +36,51 @@ RULE = Rule(
 
 MARGIN = 0.02  # part of the reach that the robot may get further
 UNKNOWN_TOLERANCE = 0.1  # part of the reach
+HARDLY_MOVES = 0.25  # part of the longest range of coordinates of the robot
 VERY_FAR = 2.0  # times the reach
 FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
+LONG, FIXED = 40, 1e-3  # steps of an episode in which a goal may move, and motion of one that does not [m]
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    """Yield a goal that is beyond where the robot gets along an axis, in several episodes."""
+    reader = BoundReader(noted)
+    found = (
+        finding
+        for places in reader.list_places()
+        for bound in reader.list_bounds(places)
+        for finding in _compare_with_bound(reader, places, bound)
+    )
+    yield from itertools.islice(found, 1)
+
+
+def _compare_with_bound(reader: BoundReader, places: ComparedPlaces, bound: Bound) -> Iterator[RuleFinding]:
+    tolerance, goals = reader.find_tolerance(places), reader.list_goals(places)
+    sizes = np.nanmax(np.concatenate(places.robots), axis=0) - np.nanmin(np.concatenate(places.robots), axis=0)
+    for axis, sign, end in bound.list_ends():
+        is_still = sizes[axis] < HARDLY_MOVES * sizes.max()
+        if tolerance is None and is_still:
+            continue  # such as a hand that stays above the table
+        allowed = UNKNOWN_TOLERANCE * sizes[axis] if tolerance is None else tolerance + MARGIN * sizes[axis]
+        rows = [goal[np.isfinite(goal[:, axis]), axis] for goal in goals]
+        beyond = [_measure_beyond(row, sign, end) for row in rows if row.size]
+        far = [one for one in beyond if one > allowed]
+        are_all = len(far) == len(beyond)
+        if len(far) >= FEWEST_FAR and not (are_all and tolerance is None):
+            name, farthest = f"{places.goal.text}[{axis}]", end + sign * max(far)
+            message = f"{name} is out of reach in {len(far)} of {len(beyond)} episodes, up to {farthest:.4g}:"
+            message += f" {places.robot.text}[{axis}] gets to {end:.4g} at most; {bound.how}"
+            evidence = {"element": name, "value": farthest, "expected": end}
+            severity = Severity.ERROR if are_all else None
+            yield RuleFinding(RULE, message, evidence, severity, where=places.distance.expression.where)
+
+
+def _measure_beyond(goals: Numbers, sign: int, end: float) -> float:
+    """Return how far a coordinate of a goal is beyond an end all the time; 0 where it moves in a short episode, as what
+    comes to the robot does."""
+    is_known = len(goals) >= LONG or np.ptp(goals) < FIXED
+    return max(0.0, float((sign * (goals - end)).min())) if is_known else 0.0
 
 
 @judges_records(RULE, *rewards.WITH_SEARCH, "goals")

@@ -7,7 +7,6 @@ import numpy as np
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import ACTION_TERMS, WEIGHED_TERMS
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.previous_values import KeptDifferences
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     ENOUGH_STEPS,
@@ -19,6 +18,7 @@ from rlctl.checking.rewards import (
 )
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.term_names import CHANGE_WORDS, ENERGY_WORDS, is_about_actions
+from rlctl.checking.zero_differences import ZeroDifferences
 
 RULE = Rule(
     "RL620",
@@ -42,7 +42,7 @@ RULE = Rule(
 
 @judges_expressions(RULE, decides=False)
 def _find_zero_differences(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    for one in noted.share(KeptDifferences).find_always_zero():
+    for one in noted.share(ZeroDifferences).find_paid():
         message = f"{one.whole.text} is 0 in all {len(noted.steps)} steps, although {one.new.text} changes:"
         message += f" {one.key} has been replaced by it before"
         yield RuleFinding(RULE, message, {"term": one.whole.text, "value": 0.0}, where=one.whole.where)

@@ -1,11 +1,13 @@
 """RL621: penalty that pays."""
 
+import ast
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     RAW_TERMS,
@@ -20,6 +22,7 @@ from rlctl.checking.rewards import (
 )
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.term_names import is_about_actions, is_about_goals, is_about_time, is_cost, is_error
+from rlctl.checking.upright_costs import find_upright_costs
 
 RULE = Rule(
     "RL621",
@@ -31,12 +34,23 @@ RULE = Rule(
         the term should prevent. Judged are terms of a task with a negative weight that are named after an error
         or a cost; costs of actions that pay more for moving than for doing nothing; a constant that is called a
         cost, or is named after time where other terms are about a goal; and, as an info, other terms that are
-        called cost or penalty.
+        called cost or penalty. In the source, a cost that squares the vertical part of a direction, which is 1 where
+        the robot stands upright.
     """,
     fix="Return the term without a sign, such as a distance or a squared action, and put the sign in the weight.",
 )
 
+LEVEL = "Square the other two parts, which are 0 upright."
 MOVING_PAYS = 2.0  # times as much as doing nothing
+
+
+@judges_expressions(RULE, decides=False)
+def _find_upright_costs(notes: NotedEpisodes) -> Iterator[RuleFinding]:
+    for summand, part in find_upright_costs(notes):
+        message = f"reward term {summand.name!r} is a cost, and squares {ast.unparse(part)}, the vertical part of a"
+        message += " direction: it is largest where the robot stands upright, and falls as it tilts"
+        yield RuleFinding(RULE, message, {"term": summand.name}, where=notes.reward.locate(summand.place), fix=LEVEL)
+        return
 
 
 @judges_records(RULE, *WITH_SEARCH)

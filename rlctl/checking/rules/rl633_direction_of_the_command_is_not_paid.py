@@ -10,6 +10,7 @@ from rlctl.checking.drawn_goals import DrawnPlace, Numbers
 from rlctl.checking.experiments.commands import LATER_STEPS, CommandTrials, judges_commands
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.paid_commands import CommandReader
+from rlctl.checking.paid_lengths import LengthReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -22,11 +23,13 @@ RULE = Rule(
         steps with the command turned back, and to the sides, and each reward was the same, while it changes with the
         length of the command. So driving in any direction at the commanded speed is paid in full. Most often two
         lengths are compared, |v| with |command|, which is also read in the source; or a command that has both signs
-        with a number that is never negative, so that half of the commands cannot be met.
+        with a number that is never negative, so that half of the commands cannot be met; or what is called the speed
+        forwards, or along a direction, is the length of the velocity.
     """,
     fix="Take the length of the difference: np.linalg.norm(velocity - command), and not the difference of the lengths.",
 )
 
+ALONG = "Multiply the velocity with the direction: velocity @ direction, or cos(heading) * vx + sin(heading) * vy."
 LENGTHS = (0.0, 0.1, 0.25, 0.5, 0.8, 1.2)  # parts of the longest command that was drawn
 DRAWN = 9  # resets, whose commands are compared
 SAME = 1e-9  # of the rewards, or of 1
@@ -116,4 +119,16 @@ def _find_compared_lengths(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         )
         message += f" which is never negative: {ast.unparse(one.place.node)}"
         yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
+        return
+    for one in notes.share(SizeReader).find_sizes_only():
+        message = f"reward term {one.summand.name!r} compares two sizes, {ast.unparse(one.place.node)}: the opposite"
+        message += " command pays the same"
+        yield RuleFinding(RULE, message, {"element": one.summand.name}, where=notes.reward.locate(one.place))
+        return
+    for length in notes.share(LengthReader).find():
+        message = f"reward term {length.summand.name!r} has {ast.unparse(length.place.node)}, called {length.called!r}:"
+        message += " it is a length, so motion in any direction is paid as the one that is meant"
+        yield RuleFinding(
+            RULE, message, {"element": length.summand.name}, fix=ALONG, where=notes.reward.locate(length.place)
+        )
         return

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rlctl.checking.angle_mistakes import AngleMistakes, find_first
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.joint_copies import DEGREES, JointCopy
 from rlctl.checking.motor_commands import CommandSpan
@@ -37,6 +39,11 @@ XML_FIX = (
     "In the XML, write ctrlrange in radians, whatever its compiler's angle is: a joint's range is converted, ctrlrange "
     'is not (inheritrange="1" takes the converted range). Both differ by gear; kp and kv are per radian.'
 )
+
+
+@judges_expressions(RULE, decides=False)
+def _find_given_degrees(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from find_first(RULE, noted.share(AngleMistakes).of_targets)
 
 
 @judges_worlds(RULE)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rlctl.checking.episode import zero_action
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.motor_commands import CommandSpan
-from rlctl.checking.motor_targets import APART, DEGREE, covers, read_first_targets
+from rlctl.checking.motor_targets import APART, DEGREE, ROUNDED, covers, read_first_targets
 from rlctl.checking.motor_trials import MotorTrial, PlayedMotors
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -24,8 +24,9 @@ RULE = Rule(
     meaning="""
         A motor gets what is meant for another joint: with the zero action the targets are the joint positions
         at reset in another order; or a command follows the position of another joint, or covers the limits of
-        another. Orders of models and policies often differ, by leg or by kind of joint, and MuJoCo's actuators
-        need not be in the order of its joints.
+        another; or the largest forces of motors are those that the model has for other joints. Orders of models and
+        policies often differ, by leg or by kind of joint, and MuJoCo's actuators need not be in the order of its
+        joints.
     """,
     fix="""
         Look joints up by their names, and use one list of indices for reading states and for setting targets.
@@ -49,8 +50,8 @@ NEAR = 0.05  # of sorted targets and positions [rad], [m]
 @judges_worlds(RULE)
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for world, spans in watched.driven:
-        if not find_targets_in_degrees(world, watched.calls):
-            yield from find_other_orders(world, spans)
+        found = [] if find_targets_in_degrees(world, watched.calls) else find_other_orders(world, spans)
+        yield from found or _find_other_strengths(world)
 
 
 def find_other_orders(world: LoggedWorld, spans: Sequence[CommandSpan]) -> list[RuleFinding]:
@@ -157,6 +158,31 @@ def _find_wrong_order(world: LoggedWorld) -> Iterator[RuleFinding]:
             message = f"{what} in another order: {joints[index]} is at {at:.3g} and gets {value:.3g}"
             evidence = {"element": joints[index], "value": value, "expected": at}
             yield RuleFinding(RULE, message, evidence, where=targets[index].where)
+            return
+
+
+def _find_other_strengths(world: LoggedWorld) -> Iterator[RuleFinding]:
+    """Yield a motor with the strength that the model gives another joint, where two motors have each other's, or all
+    are those of the model but for their order."""
+    strengths = world.reader.read_strengths()
+    for body in world.world.bodies:
+        driven = [joint for joint in body.joints if joint.effort > 0 and (body.id, joint.index) in strengths]
+        given = np.array([strengths[body.id, joint.index].force for joint in driven])
+        efforts = np.array([joint.effort for joint in driven])
+        is_effort = np.isclose(given[:, None], efforts[None, :], ROUNDED)  # of the joint of each column
+        is_wrong = ~np.diagonal(is_effort)
+        exchanged = is_effort & is_effort.T & is_wrong[:, None] & is_wrong[None, :]
+        if is_wrong.any() and np.allclose(np.sort(given), np.sort(efforts), ROUNDED):
+            exchanged = is_effort & is_wrong[:, None] & is_wrong[None, :]
+        if exchanged.any():
+            one, other = (int(place) for place in np.argwhere(exchanged)[0])
+            joint, has = driven[one], float(given[one])
+            unit = "N m" if joint.is_angle else "N"
+            what = f"the motors of {body.name} have the largest forces of its model in another order"
+            message = f"{what}: {joint.name} gets {has:.4g} {unit}, which the model has for {driven[other].name}, and"
+            message += f" {joint.effort:.4g} for {joint.name}"
+            evidence = {"element": joint.name, "value": has, "expected": joint.effort}
+            yield RuleFinding(RULE, message, evidence, where=strengths[body.id, joint.index].where)
             return
 
 

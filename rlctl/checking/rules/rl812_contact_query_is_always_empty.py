@@ -179,6 +179,8 @@ def _explain_empty(world: LoggedWorld, query: ContactQuery) -> tuple[str, Severi
     for body, link in zip(query.bodies, query.links, strict=True):
         if body not in existing:
             return f"there is no body {body}", Severity.WARNING
+        if link is not None and body >= 0 and link >= p.getNumJoints(body):
+            return f"{world.world.link_name((body, -1))} has no link {link}", Severity.WARNING
         if body in known and link is not None and not _has_shape(world, body, link):
             name = world.world.link_name((body, link))
             return f"{name} (link {link}) has no collision shape", Severity.WARNING

@@ -17,8 +17,10 @@ from rlctl.checking.derived_fields import (
 )
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import find_log_without_engine
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.instance import Instance
+from rlctl.checking.late_readings import LateReadings
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
 from rlctl.checking.old_ways import find_old_ways
@@ -42,7 +44,9 @@ RULE = Rule(
         the last stepSimulation. MuJoCo - mj_step leaves xpos, site_xpos, sensordata and all else that follows
         from positions as they were at the beginning of its last substep; and where reset writes qpos without
         mj_forward, they are of the episode before, or 0 after mj_resetData. A robot without an engine - the length
-        of a vector follows where an attribute was before the step, and not where it is.
+        of a vector follows where an attribute was before the step, and not where it is. With any engine or none -
+        a line of the source reads a part of the state before the step moves the robot, and the observation has it
+        afterwards, next to parts that are read later.
     """,
     fix="""
         Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
@@ -58,6 +62,7 @@ FORWARD = (
 )
 READ_MUJOCO = "Read after the last mj_step; then call mujoco.mj_forward(model, data) for what follows from positions."
 READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., computeForwardKinematics=True)."
+READ_LINES = "Read it after the last step of the physics, or after the robot's own equations."
 READ_ATTRIBUTES = "Compute what is observed after the robot has moved."
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
 EXACT = 2e-6  # relative; the last bits of float32 and of sums
@@ -98,6 +103,18 @@ def _judge_attributes(records: Records) -> Iterator[RuleFinding]:
         )
         evidence = {"element": names[elements.start], "value": place}
         yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_ATTRIBUTES)
+        return
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_lines(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    """Yield the first value that the source reads before it moves the robot, and observes afterwards."""
+    for one in noted.share(LateReadings).find():
+        message = f"the observation has {one.read.text} (line {one.read.node.lineno}), for which {one.value.text} is"
+        message += " read before the robot moves, and not again afterwards: it is one step older than the rest"
+        evidence = {"element": one.read.text}
+        same = ("RL115", "RL616", "RL617")  # all is late then
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_LINES, where=one.value.where, same=same)
         return
 
 

@@ -1,5 +1,6 @@
 """RL839: another field is read."""
 
+import ast
 from collections.abc import Iterator
 
 from rlctl.checking.bullet_fields import BulletFields, find_other_meaning
@@ -13,7 +14,8 @@ RULE = Rule(
     meaning="""
         PyBullet returns tuples, whose fields have places and no names. The source reads a field that is something else
         than what the result is called: the torque of a joint as its velocity, the distance of a contact as its force,
-        the angular velocity of a base as the linear one. The numbers look plausible and are wrong.
+        the angular velocity of a base as the linear one. The numbers look plausible and are wrong. Of MuJoCo's
+        mj_contactForce, one of the tangential forces is read and never the normal one.
     """,
     fix="""
         Read the place that the documentation of the function names: getJointState has position, velocity, reaction
@@ -21,6 +23,9 @@ RULE = Rule(
         distance, 9 the normal force; getLinkState at 4 and 5 the frame of the link, 6 and 7 its velocities.
     """,
 )
+
+TANGENTIAL = (1, 2)
+NORMAL = "Read element 0: the frame of a contact begins with its normal."
 
 
 @judges_expressions(RULE)
@@ -35,3 +40,33 @@ def _find_other_fields(noted: NotedEpisodes) -> Iterator[RuleFinding]:
             where = source.find_place(read.node)
             yield RuleFinding(RULE, message, {"element": name, "value": read.field}, where=where)
             return
+
+
+@judges_expressions(RULE)
+def _find_tangential_forces(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    for function in noted.functions:
+        for node in ast.walk(function):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="mj_contactForce"), args=[_, _, _, ast.Name(id=name)]):
+                    place = _find_only_element(function, name)
+                    if place is not None and place in TANGENTIAL:
+                        message = f"{name}[{place}] of mj_contactForce is a tangential force, in the frame of the"
+                        message += f" contact: the normal force is {name}[0], which nothing reads"
+                        where = noted.source.find_place(node)
+                        yield RuleFinding(RULE, message, {"element": name, "value": place}, where=where, fix=NORMAL)
+                        return
+
+
+def _find_only_element(function: ast.AST, name: str) -> int | None:
+    """Return which element of an array a function reads, where it is one, and nothing else is done with the array."""
+    places: set[int] = set()
+    reads = 0
+    for node in ast.walk(function):
+        match node:
+            case ast.Subscript(value=ast.Name(id=read), slice=ast.Constant(value=int(place))) if read == name:
+                places.add(place)
+                reads += 1
+            case ast.Name(id=read, ctx=ast.Load()) if read == name:
+                reads -= 1
+    # Each element has a name of its own; one more is the argument of the call.
+    return places.pop() if len(places) == 1 and reads == -1 else None

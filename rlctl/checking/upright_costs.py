@@ -1,0 +1,59 @@
+"""Costs of a tilt that square the vertical part of a direction: they are largest where a robot stands upright."""
+
+import ast
+from collections.abc import Iterator
+
+import numpy as np
+
+from rlctl.checking.assignments import read_name
+from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.summands import Summand
+
+FEWEST = 20  # values
+UNIT = 1e-3  # how far from 1 the length of a direction may be
+UPRIGHT = 0.9  # of its vertical part, at the start of episodes
+
+
+def find_upright_costs(notes: NotedEpisodes) -> Iterator[tuple[Summand, ast.expr]]:
+    """Yield the summand, and the vertical part that it squares."""
+    for summand in notes.reward.summands:
+        for place in notes.definitions.walk(summand.place) if summand.weight < 0 else ():
+            squared = _read_squared(place.node)
+            if squared is not None and _is_vertical_part(squared) and _is_upright(notes, squared):
+                yield summand, squared
+
+
+def _read_squared(node: ast.expr) -> ast.Subscript | None:
+    match node:
+        case ast.BinOp(left=ast.Subscript() as base, op=ast.Pow(), right=ast.Constant(value=2)):
+            return base
+        case ast.BinOp(left=ast.Subscript() as base, op=ast.Mult(), right=other) if ast.dump(base) == ast.dump(other):
+            return base
+        case ast.Call(func=function, args=[ast.Subscript() as base]) if read_name(function) == "square":
+            return base
+    return None
+
+
+def _is_vertical_part(node: ast.Subscript) -> bool:
+    index = node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) and node.slice.elts else node.slice
+    match index:
+        case ast.Constant(value=2 | -1) | ast.Slice(lower=ast.Constant(value=2), upper=None, step=None):
+            return True
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=1)):
+            return True
+    return False
+
+
+def _is_upright(notes: NotedEpisodes, node: ast.Subscript) -> bool:
+    """Say whether it is a part of directions in space, which begin vertical."""
+    vector, part = notes.source.find(node.value), notes.source.find(node)
+    if vector is None or part is None:
+        return False
+    directions = [value for call in notes.steps for value in call.values.get(vector.number, ())]
+    if len(directions) < FEWEST or any(value is None or np.shape(value)[-1:] != (3,) for value in directions):
+        return False
+    lengths = [np.linalg.norm(value, axis=-1) for value in directions if value is not None]
+    starts = [value for episode in notes.episodes for value in episode[1].values.get(part.number, ())[:1]]
+    begins = [float(np.min(np.abs(value))) for value in starts if value is not None]
+    is_unit = bool(np.allclose(np.concatenate([np.ravel(one) for one in lengths]), 1.0, atol=UNIT))
+    return is_unit and bool(begins) and min(begins) > UPRIGHT
