@@ -3,13 +3,12 @@
 import ast
 import dataclasses
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from rlctl.checking.assignments import read_key, read_name
-from rlctl.checking.episode import Moment
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.previous_values import (
@@ -23,6 +22,7 @@ from rlctl.checking.previous_values import (
     read_sides,
 )
 from rlctl.checking.source_code import Expression
+from rlctl.checking.values import flatten
 
 NO_CHANGES = {
     *("max", "min", "maximum", "minimum", "fmax", "fmin", "clip", "where", "allclose", "isclose", "array_equal"),
@@ -135,28 +135,17 @@ class ZeroDifferences:
                 for forced in ({}, {step: {value.number: _move(before)}})
             ]
             pairs = list(zip(*(part[step:] for part in played), strict=False))
-            return any(_list_numbers(one) != _list_numbers(other) for one, other in pairs)
+            return any(
+                one.reward_number != other.reward_number
+                or not np.array_equal(flatten(one.observation), flatten(other.observation), equal_nan=True)
+                for one, other in pairs
+            )
         return False
 
 
 def _move(value: Value) -> Any:
     moved = np.asarray(value) + FORCED
     return moved if isinstance(value, np.ndarray) else float(moved)
-
-
-def _list_numbers(moment: Moment) -> list[float]:
-    """Return the reward and the numbers of the observation."""
-    leaves: list[Any] = [moment.observation]
-    found = [moment.reward_number]
-    while leaves:
-        leaf = leaves.pop()
-        if isinstance(leaf, Mapping):
-            leaves += leaf.values()
-        elif isinstance(leaf, tuple | list):
-            leaves += leaf
-        elif isinstance(leaf, np.ndarray | float | int | np.generic):
-            found += np.ravel(np.asarray(leaf, np.float64)).tolist()
-    return found
 
 
 def _list_runs(noted: NotedEpisodes, call: NotedCall, value: Expression) -> Iterator[NotedCall]:
