@@ -12,6 +12,7 @@ from rlctl.checking.assignments import read_key, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Number, Value
+from rlctl.checking.previous_values import list_changes
 from rlctl.checking.source_code import Expression
 
 TURN = 2 * math.pi
@@ -51,9 +52,12 @@ class UnwrappedAngles:
                 yield one, largest
 
     def find_shown(self) -> Iterator[tuple[Expression, float]]:
-        """Yield differences that are observed and were more than half a turn."""
+        """Yield differences that are observed and were more than half a turn, of directions that turn round: a joint
+        with stops has to go the long way."""
         for one, largest in self._differences:
-            if largest > SLACK * math.pi and self._matters(one, self.notes.changes_observation):
+            assert isinstance(one.node, ast.BinOp)
+            turn_round = all(map(self._turns_round, (one.node.left, one.node.right)))
+            if largest > SLACK * math.pi and turn_round and self._matters(one, self.notes.changes_observation):
                 yield one, largest
 
     @functools.cached_property
@@ -71,6 +75,19 @@ class UnwrappedAngles:
 
     def _find_largest(self, one: Expression) -> float:
         return max(map(_size, _list_values(one, self._calls)), default=0.0)
+
+    def _turns_round(self, node: ast.expr) -> bool:
+        """Say whether an angle is wrapped, by the source or by what it was, or goes on beyond half a turn."""
+        side = self.source.find(node)
+        if side is None:
+            return False
+        rows = [
+            [call.values[side.number][-1] for call in episode if side.number in call.values]
+            for episode in self.notes.episodes
+        ]
+        changes = [change for row in rows for change in list_changes(row)]
+        seen = max([self._find_largest(side), *changes])
+        return self._is_wrapped(side) or seen > SLACK * math.pi
 
     def _jumps(self, node: ast.expr) -> bool:
         """Say whether an angle is wrapped, and may be where it is."""

@@ -39,7 +39,7 @@ UNKNOWN_TOLERANCE = 0.1  # part of the reach
 HARDLY_MOVES = 0.25  # part of the longest range of coordinates of the robot
 VERY_FAR = 2.0  # times the reach
 FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
-LONG, FIXED = 40, 1e-3  # steps of an episode in which a goal may move, and motion of one that does not [m]
+FIXED, MOSTLY_FIXED = 1e-3, 0.8  # motion of a goal that does not move [m], and the part of the episodes with one
 
 
 @judges_expressions(RULE, decides=False)
@@ -64,7 +64,10 @@ def _compare_with_bound(reader: BoundReader, places: ComparedPlaces, bound: Boun
             continue  # such as a hand that stays above the table
         allowed = UNKNOWN_TOLERANCE * sizes[axis] if tolerance is None else tolerance + MARGIN * sizes[axis]
         rows = [goal[np.isfinite(goal[:, axis]), axis] for goal in goals]
-        beyond = [_measure_beyond(row, sign, end) for row in rows if row.size]
+        fixed = [row for row in rows if row.size and np.ptp(row) < FIXED]
+        if len(fixed) < MOSTLY_FIXED * len(rows):
+            continue  # it may come to the robot
+        beyond = [max(0.0, float((sign * (row - end)).min())) for row in fixed]
         far = [one for one in beyond if one > allowed]
         are_all = len(far) == len(beyond)
         if len(far) >= FEWEST_FAR and not (are_all and tolerance is None):
@@ -74,13 +77,6 @@ def _compare_with_bound(reader: BoundReader, places: ComparedPlaces, bound: Boun
             evidence = {"element": name, "value": farthest, "expected": end}
             severity = Severity.ERROR if are_all else None
             yield RuleFinding(RULE, message, evidence, severity, where=places.distance.expression.where)
-
-
-def _measure_beyond(goals: Numbers, sign: int, end: float) -> float:
-    """Return how far a coordinate of a goal is beyond an end all the time; 0 where it moves in a short episode, as what
-    comes to the robot does."""
-    is_known = len(goals) >= LONG or np.ptp(goals) < FIXED
-    return max(0.0, float((sign * (goals - end)).min())) if is_known else 0.0
 
 
 @judges_records(RULE, *rewards.WITH_SEARCH, "goals")
