@@ -5,7 +5,7 @@ from robots import Arm
 
 
 class Reacher(Arm):
-    """Its tip is at most 0.82 m from its base."""
+    """Its tip is at most 0.82 m from its base, and hardly moves along y."""
 
     farthest = 0.6  # goal, from the base [m]
 
@@ -15,7 +15,9 @@ class Reacher(Arm):
 
     def draw_goal(self):
         direction = self.np_random.normal(size=3)
-        return self.np_random.uniform(0.3, self.farthest) * direction / np.linalg.norm(direction)
+        goal = self.np_random.uniform(0.3, self.farthest) * direction / np.linalg.norm(direction)
+        goal[1] = np.clip(goal[1], -0.1, 0.1)
+        return goal
 
     def size(self):
         return super().size() + 3

@@ -175,8 +175,8 @@ class _Jumps:
     is_judged: NDArray[np.bool_]  # Whether the steps around are known. Shape (n,)
     sizes: NDArray[np.float64]  # of the changes. Shape (n,)
 
-    def are_many(self, steps: Transitions, rows: NDArray[np.bool_]) -> bool:
-        return rows.sum() >= FEWEST_JUMPS and len(np.unique(steps.seeds[rows])) >= FEWEST_SEEDS
+    def are_many(self, steps: Transitions, rows: NDArray[np.bool_], fewest: int = FEWEST_JUMPS) -> bool:
+        return rows.sum() >= fewest and len(np.unique(steps.seeds[rows])) >= FEWEST_SEEDS
 
 
 def _judge_passes(
@@ -198,16 +198,19 @@ def _judge_passes(
 def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> tuple[float, str] | None:
     """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
     times pi - |e|, where its cosine and sine are observed, or a vector in its direction. None if it does not."""
+    known = find_unit_pairs(steps.before)
     for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
+        # One of many pairs that may be no direction fits a few jumps by chance.
+        fewest = FEWEST_JUMPS if {(cosine, sine), (sine, cosine)} & {*known} else 2 * FEWEST_JUMPS
         room = np.pi - np.abs(_angle(steps.after, cosine, sine))
         rows = jumps.is_jump & (room > LEAST_ROOM)
-        if not jumps.are_many(steps, rows):
+        if not jumps.are_many(steps, rows, fewest):
             continue
         factors = jumps.sizes[rows] / room[rows]
         fits = np.abs(factors / np.median(factors) - 1) < SAME_FACTOR
         low, high = np.quantile(room[rows][fits], (0.1, 0.9)) if fits.any() else (1.0, 1.0)
         rows[rows] = fits
-        if jumps.are_many(steps, rows) and fits.mean() >= MOST_FIT and high > SPREAD * low:
+        if jumps.are_many(steps, rows, fewest) and fits.mean() >= MOST_FIT and high > SPREAD * low:
             name = f"({steps.names[cosine]}, {steps.names[sine]})"
             factor = float(np.median(factors))
             where = f"in {int(rows.sum())} steps in which the angle e of {name} changes little"
