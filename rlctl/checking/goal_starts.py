@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import itertools
 import re
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -74,11 +75,12 @@ class GoalStarts:
 
     def _is_to_stay(self) -> bool:
         said: list[str] = []
-        for tree in self.source.trees.values():
-            if sum(isinstance(node, ast.ClassDef) for node in tree.body) == 1:  # it is about this one
-                said += re.split(r"\W+", ast.get_docstring(tree) or "")
         for cls in list_own_classes(self.source.author):
-            said += [*split_name(cls.__name__), *re.split(r"\W+", cls.__doc__ or "")]
+            module = sys.modules.get(cls.__module__)
+            classes = [one for one in vars(module).values() if isinstance(one, type)] if module is not None else []
+            is_alone = [one for one in classes if one.__module__ == cls.__module__] == [cls]
+            texts = [cls.__doc__, module.__doc__ if module is not None and is_alone else None]
+            said += [*split_name(cls.__name__), *(word for text in texts for word in re.split(r"\W+", text or ""))]
         return bool({word.lower() for word in said} & STAYING_WORDS)
 
     def _read_goal(self, key: str) -> list[Value] | None:

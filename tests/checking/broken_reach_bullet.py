@@ -8,6 +8,7 @@ class Reacher(Arm):
     """Its tip is at most 0.82 m from its base, and hardly moves along y."""
 
     farthest = 0.6  # goal, from the base [m]
+    rlctl_ignore = {**Arm.rlctl_ignore, "RL619": "it hardly moves along y, where goals are, too"}
 
     def start(self):
         super().start()
@@ -15,9 +16,7 @@ class Reacher(Arm):
 
     def draw_goal(self):
         direction = self.np_random.normal(size=3)
-        goal = self.np_random.uniform(0.3, self.farthest) * direction / np.linalg.norm(direction)
-        goal[1] = np.clip(goal[1], -0.1, 0.1)
-        return goal
+        return self.np_random.uniform(0.3, self.farthest) * direction / np.linalg.norm(direction)
 
     def size(self):
         return super().size() + 3
@@ -38,5 +37,16 @@ class Reacher(Arm):
         return {"is_success": success}
 
 
-class RL619ReacherFarGoals(Reacher):
+class ReacherOfThePlane(Reacher):
+    """Its goals are in the plane in which it moves."""
+
+    rlctl_ignore = Arm.rlctl_ignore
+
+    def draw_goal(self):
+        goal = super().draw_goal()
+        goal[1] = np.clip(goal[1], -0.1, 0.1)
+        return goal
+
+
+class RL619ReacherFarGoals(ReacherOfThePlane):
     farthest = 1.4

@@ -35,7 +35,7 @@ CASES = [
     case(
         "broken_reach_bullet.py:RL619ReacherFarGoals",
         ("RL619", "warning"),
-        twin="broken_reach_bullet.py:Reacher",
+        twin="broken_reach_bullet.py:ReacherOfThePlane",
         pybullet=True,
         slow=True,
     ),
