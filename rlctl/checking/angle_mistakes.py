@@ -1,7 +1,6 @@
 """Where a source mixes degrees and radians, converts an angle wrongly, or gives degrees to what takes radians."""
 
 import ast
-import dataclasses
 from collections.abc import Iterator, Mapping
 
 from rlctl.checking.angle_readings import STATES, AngleReadings
@@ -9,7 +8,7 @@ from rlctl.checking.angle_units import Angle, Unit, list_factors, read_words
 from rlctl.checking.assignments import list_assignments, read_key, read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.rule import Rule, RuleFinding
-from rlctl.checking.source_code import Function, walk_own, write_code
+from rlctl.checking.source_code import FaultyCode, Function, walk_own, write_code
 
 TARGETS: Mapping[str, tuple[int, set[str]]] = {
     "resetJointState": (2, {"targetValue"}),
@@ -25,22 +24,13 @@ ADDED_TO = {"qpos", "qvel", "joint_positions"}
 HELD = STATES - {"jnt_range"}
 
 
-@dataclasses.dataclass(frozen=True)
-class AngleMistake:
-    """A piece of code that takes an angle for one of another unit."""
-
-    node: ast.expr
-    message: str
-    where: tuple[str, int]
-
-
 class AngleMistakes:
     """Those of the environment's functions."""
 
     def __init__(self, noted: NotedEpisodes) -> None:
         self.noted, self.readings = noted, noted.share(AngleReadings)
-        self.of_targets: list[AngleMistake] = []
-        self.of_mixtures: list[AngleMistake] = []
+        self.of_targets: list[FaultyCode] = []
+        self.of_mixtures: list[FaultyCode] = []
         for function in noted.own_functions:
             for node in walk_own(function):
                 if isinstance(node, ast.expr) and noted.source.find(node) is not None:
@@ -54,8 +44,8 @@ class AngleMistakes:
         ]
         self.of_mixtures = [] if self.of_functions or self.of_targets else [*self.of_mixtures, *found]
 
-    def _make(self, node: ast.expr, what: str) -> AngleMistake:
-        return AngleMistake(node, f"{write_code(node)} {what}", self.noted.source.find_place(node))
+    def _make(self, node: ast.expr, what: str) -> FaultyCode:
+        return FaultyCode(node, f"{write_code(node)} {what}", self.noted.source.find_place(node))
 
     def _read_given(self, call: ast.Call, function: Function) -> None:
         place, words = TARGETS.get(read_name(call.func), (len(call.args), set[str]()))
@@ -76,7 +66,7 @@ class AngleMistakes:
             was = "is converted as an angle" if angle.unit is not Unit.PER_DEGREE else "is one per degree"
             what = f"{was} ({angle.why}): gains of joints are per radian"
             self.of_mixtures.append(
-                AngleMistake(value, f"{write_code(value)} {what}", self.noted.source.find_place(call))
+                FaultyCode(value, f"{write_code(value)} {what}", self.noted.source.find_place(call))
             )
 
     def _find_degrees(self, value: ast.expr, function: Function) -> Angle | None:
@@ -98,8 +88,8 @@ class AngleMistakes:
                 self.of_mixtures.append(self._make(one.value, what))
 
 
-def find_first(rule: Rule, mistakes: list[AngleMistake]) -> Iterator[RuleFinding]:
+def find_first(rule: Rule, mistakes: list[FaultyCode]) -> Iterator[RuleFinding]:
     """Yield the first mistake of a list; what follows from it is known then."""
     for one in mistakes[:1]:
         evidence = {"element": write_code(one.node), "value": len(mistakes)}
-        yield RuleFinding(rule, one.message, evidence, where=one.where)
+        yield RuleFinding(rule, one.what, evidence, where=one.where)

@@ -21,6 +21,7 @@ SIZES = {"norm", "hypot", "abs", "absolute", "fabs", "square", "sqrt"}
 SAME_SIGN = CONVERSIONS | {"sum", "mean", "max", "min", "clip", "round"}
 BEGINNINGS = {"zeros", "zeros_like"}
 FEWEST_STEPS = 3  # before the one whose command is turned round
+SAME = 1e-6
 MOST_SEEN = 100  # names that are followed
 MET = 0.98  # of the largest value of a kernel: what a tolerance pays that everything meets
 CLEARLY, MOST_CHANGES = 0.25, 0.1  # parts: of the largest difference, of the steps
@@ -100,7 +101,7 @@ class SizeReader:
                 values = [call.values[one][-1] for one in numbers if call.values.get(one)]
                 if values and values[0] is not None and np.any(values[0]):
                     opposite = dict.fromkeys(numbers, -values[0])
-                    return self.notes.changes_reward(number, call.step, {}, opposite) is not False
+                    return self.notes.changes(number, call.step, {}, opposite, tolerance=SAME) is not False
         return True
 
     @functools.cached_property

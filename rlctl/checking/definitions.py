@@ -133,7 +133,7 @@ class Definitions:
         function = self.find_function(read_name(call.func))
         if function is None:
             return []
-        arguments = {key: place.at(value) for key, value in _bind(call, function).items()}
+        arguments = {key: place.at(value) for key, value in bind(call, list_parameters(function)).items()}
         return self.list_results(function, arguments, place.depth)
 
     def list_results(
@@ -149,7 +149,7 @@ class Definitions:
         function = place.function
         if place.arguments or name in self.list_assigned(function) or len(self.functions.get(function.name, ())) > 1:
             return []
-        calls = [(_bind(call, function), caller) for call, caller in self.calls.get(function.name, ())]
+        calls = [(bind(call, list_parameters(function)), caller) for call, caller in self.calls.get(function.name, ())]
         return [ReadExpression(given[name], caller, {}, place.depth) for given, caller in calls if name in given]
 
     def _follow_attribute(self, place: ReadExpression) -> list[ReadExpression]:
@@ -287,9 +287,9 @@ class Definitions:
         return found
 
 
-def _bind(call: ast.Call, function: Function) -> dict[str, ast.expr]:
-    """Return what a call gives to the parameters of a function."""
-    given = dict(zip(list_parameters(function), call.args, strict=False))
+def bind(call: ast.Call, names: Sequence[str]) -> dict[str, ast.expr]:
+    """Return what a call gives to parameters of these names."""
+    given = dict(zip(names, call.args, strict=False))
     return given | {word.arg: word.value for word in call.keywords if word.arg}
 
 

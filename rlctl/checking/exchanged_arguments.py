@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.assignments import list_parameters, read_name
-from rlctl.checking.episode import Moment
-from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.definitions import bind
+from rlctl.checking.experiments.expressions import NotedEpisodes, read_step
 from rlctl.checking.source_code import Expression
 from rlctl.checking.term_names import split_name
-from rlctl.checking.values import flatten
 
 LOW_WORDS, HIGH_WORDS = {"low", "lower", "lo", "min", "minimum"}, {"high", "upper", "hi", "max", "maximum"}
 SYMMETRIC_WORDS = {"left", "right", "first", "second", "one", "two", "a", "b"}
@@ -62,9 +61,7 @@ class CallReader:
         if any(isinstance(argument, ast.Starred) for argument in call.args):
             return {}
         own = self.definitions.find_function(read_name(call.func))
-        names = list_parameters(own) if own is not None else self._list_foreign(call.func)
-        given = dict(zip(names, call.args, strict=False))
-        return given | {word.arg: word.value for word in call.keywords if word.arg}
+        return bind(call, list_parameters(own) if own is not None else self._list_foreign(call.func))
 
     def _list_foreign(self, node: ast.expr) -> list[str]:
         """Return the parameters of a function of another module; nothing where it cannot be read."""
@@ -112,13 +109,5 @@ class CallReader:
                 if first is None or second is None or np.shape(first) != np.shape(second):
                     continue
                 exchanged = {one.number: second, other.number: first}
-                played = [self.notes.play(number, call.step, {call.step: values}) for values in ({}, exchanged)]
-                return all(len(calls) > call.step for calls in played) and not _are_same(
-                    *(calls[call.step][1] for calls in played)
-                )
+                return bool(self.notes.changes(number, call.step, {}, exchanged, read=read_step))
         return False
-
-
-def _are_same(one: Moment, other: Moment) -> bool:
-    observed = np.array_equal(flatten(one.observation), flatten(other.observation), equal_nan=True)
-    return one.reward_number == other.reward_number and one.flags == other.flags and observed

@@ -121,8 +121,7 @@ class GoalDraws:
 
     def _draws(self, assignment: Assignment) -> bool:
         tops = [top for top, _ in self.definitions.list_sources(assignment.value, assignment.function)]
-        calls = [node for top in tops for node in ast.walk(top) if isinstance(node, ast.Call)]
-        return any(isinstance(call.func, ast.Attribute) and call.func.attr in DRAWS for call in calls)
+        return any(is_draw(node) for top in tops for node in ast.walk(top))
 
     @functools.cached_property
     def _evaluated(self) -> set[int]:
@@ -211,6 +210,11 @@ class GoalDraws:
 
 def _is_mask(value: Value) -> bool:
     return isinstance(value, np.ndarray) and value.ndim > 0 and bool(np.isin(value, (0.0, 1.0)).all())
+
+
+def is_draw(node: ast.AST) -> bool:
+    """Say whether code calls a random generator."""
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in DRAWS
 
 
 def _counts(assignment: Assignment) -> bool:

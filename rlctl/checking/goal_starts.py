@@ -1,7 +1,6 @@
 """Goals that are where an episode starts, and draws of goals that come to nothing."""
 
 import ast
-import dataclasses
 import itertools
 import re
 import sys
@@ -12,9 +11,9 @@ import numpy as np
 from rlctl.checking.assignments import Assignment, read_key, read_name, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Value
-from rlctl.checking.goal_draws import DRAWS
+from rlctl.checking.goal_draws import is_draw
 from rlctl.checking.previous_values import is_goal
-from rlctl.checking.source_code import Expression, Function, walk_own, write_code
+from rlctl.checking.source_code import Expression, FaultyCode, Function, walk_own, write_code
 from rlctl.checking.stale_values import FIRST_WORDS
 from rlctl.checking.term_names import split_name
 from rlctl.checking.values import list_own_classes
@@ -25,20 +24,10 @@ STAYING_WORDS = {
     "keeps", "keeping", "stabilize", "stabilizes", "stabilization", "stand", "stands", "station", "stay", "stays",
 }  # fmt: skip
 """What an environment says of itself whose goal is to stay where it starts."""
-GENERATORS = {"default_rng", "RandomState"}
 SAME = 1e-5
 MOVED = 1e-3
 FEWEST_EPISODES = 3
 UNUSED = {"_", "dummy", "unused", "ignored"}
-
-
-@dataclasses.dataclass(frozen=True)
-class GoalFault:
-    """What is wrong with a goal."""
-
-    node: ast.stmt | ast.expr
-    what: str
-    where: tuple[str, int]
 
 
 class GoalStarts:
@@ -48,8 +37,8 @@ class GoalStarts:
         self.noted, self.definitions, self.source = noted, noted.definitions, noted.source
         self.resets = [episode[0] for episode in noted.episodes]
 
-    def _make(self, node: ast.stmt | ast.expr, what: str) -> GoalFault:
-        return GoalFault(node, f"{write_code(node)}: {what}", self.source.find_place(node))
+    def _make(self, node: ast.stmt | ast.expr, what: str) -> FaultyCode:
+        return FaultyCode(node, f"{write_code(node)}: {what}", self.source.find_place(node))
 
     def _list_goals(self) -> Iterator[tuple[str, list[Assignment]]]:
         """Yield the attributes that are goals, and where resets set them; not what steps set."""
@@ -60,7 +49,7 @@ class GoalStarts:
             if of_resets and not of_steps and (is_goal(key) or words & AIM_WORDS) and not words & FIRST_WORDS:
                 yield key, of_resets
 
-    def find_at_start(self) -> Iterator[GoalFault]:
+    def find_at_start(self) -> Iterator[FaultyCode]:
         """Yield goals that are, at each start, what they are compared with."""
         if len(self.noted.episodes) < FEWEST_EPISODES or self._is_to_stay():
             return
@@ -114,7 +103,7 @@ class GoalStarts:
         later = [value for call in self.noted.episodes[0][1:] for value in call.values.get(state.number, ())]
         return any(value is not None and not _equal(value, values[0], MOVED) for value in later)
 
-    def find_vain_draws(self) -> Iterator[GoalFault]:
+    def find_vain_draws(self) -> Iterator[FaultyCode]:
         """Yield goals that resets draw and that are then replaced, or never used, or that have no choice."""
         for function in self.noted.of_resets:
             if not isinstance(function, Function) or function in self.noted.of_steps:
@@ -128,38 +117,27 @@ class GoalStarts:
                         what = f"it is drawn, and replaced at once by {write_code(other.value)}"
                         yield self._make(one.statement, what)
 
-    def find_first_draws(self) -> Iterator[GoalFault]:
+    def find_first_draws(self) -> Iterator[FaultyCode]:
         """Yield goals that only the first reset draws, as long as the environment lasts."""
         for _, assignments in self._list_goals():
             for one in assignments:
-                draws = [node for node in ast.walk(self._find_draw(one)) if self._is_draw(node)]
+                draws = [node for node in ast.walk(self._find_draw(one)) if is_draw(node)]
                 numbers = [found.number for node in draws if (found := self.source.find(node)) is not None]
                 is_first = any(number in self.resets[0].values for number in numbers)
                 is_later = any(number in call.values for call in self.resets[1:] for number in numbers)
                 if numbers and is_first and not is_later and len(self.resets) > 1:
                     yield self._make(one.statement, "only the first reset draws this goal, and later ones keep it")
 
-    def find_fixed_generators(self) -> Iterator[GoalFault]:
-        """Yield generators that each reset makes anew from one number: they draw the same in each episode."""
-        for function in self.noted.of_resets:
-            for node in ast.walk(function) if isinstance(function, Function) and function.name != "__init__" else ():
-                match node:
-                    case ast.Call(func=called, args=[ast.Constant(value=int(seed))]) if read_name(called) in GENERATORS:
-                        yield self._make(node, f"each reset draws what the seed {seed} gives, whatever its own seed is")
-
     def _find_draw(self, one: Assignment) -> ast.expr:
         for node in ast.walk(one.value):
             if isinstance(node, ast.Name):
                 origin = self.definitions.find_origin(node, one.function)
-                if self._is_draw(origin):
+                if is_draw(origin):
                     return origin
         return one.value
 
-    def _is_draw(self, node: ast.AST) -> bool:
-        return isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in DRAWS
-
     def _draws(self, node: ast.AST) -> bool:
-        return any(self._is_draw(one) for one in ast.walk(node))
+        return any(is_draw(one) for one in ast.walk(node))
 
     def _is_unused(self, one: Assignment, function: Function) -> bool:
         """Say whether a local goal is drawn and never read."""

@@ -2,7 +2,6 @@
 and attributes that are set under conditions which episodes of a check hardly ever meet."""
 
 import ast
-import dataclasses
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,7 +10,7 @@ from rlctl.checking.assignments import Assignment, read_key, read_name, read_wor
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.goal_draws import Branch, GoalDraws
-from rlctl.checking.source_code import Function, write_code
+from rlctl.checking.source_code import FaultyCode, Function, write_code
 
 RESETS = {"reset", "reset_model", "reset_idx", "_reset"}
 REMOVED = {
@@ -32,15 +31,6 @@ LASTING_WORDS = {
 """What is meant to last longer than an episode."""
 FORCED_FROM, FORCED_STEPS = 2, 5
 MOST_TRIED = 6
-
-
-@dataclasses.dataclass(frozen=True)
-class LeftOver:
-    """What a step makes or sets, and no reset takes back."""
-
-    node: ast.stmt | ast.expr
-    what: str
-    where: tuple[str, int]
 
 
 class LeftOvers:
@@ -71,7 +61,7 @@ class LeftOvers:
         first = self.definitions.find_function(name) if f"super().{name}(" not in ast.unparse(caller) else None
         return [first] if first is not None else several
 
-    def find_made(self) -> Iterator[LeftOver]:
+    def find_made(self) -> Iterator[FaultyCode]:
         """Yield what steps make in PyBullet, where nothing that resets run removes anything of the kind."""
         called = {name for one in self._resets for name in _list_calls(one)}
         for function in self._steps:
@@ -83,9 +73,9 @@ class LeftOvers:
                     removal = min(removing - {"resetSimulation", "disconnect"})
                     what = f"{read_name(node.func)} in a step, and no reset calls {removal}: what an episode has"
                     what += " made is still there in the next one"
-                    yield LeftOver(node, what, self.source.find_place(node))
+                    yield FaultyCode(node, what, self.source.find_place(node))
 
-    def find_fields(self) -> Iterator[LeftOver]:
+    def find_fields(self) -> Iterator[FaultyCode]:
         """Yield fields of MuJoCo's data that steps set under a condition, and resets never."""
         called = {name for one in self._resets for name in _list_calls(one)}
         if (
@@ -101,9 +91,9 @@ class LeftOvers:
             is_always = any(not self.definitions.list_conditions(one.statement) for one in several)
             if field in FIELDS and several and not is_reset and not is_always:
                 what = f"{write_code(several[0].statement)} in a step, and no reset sets it back or calls mj_resetData"
-                yield LeftOver(several[0].statement, what, self.source.find_place(several[0].statement))
+                yield FaultyCode(several[0].statement, what, self.source.find_place(several[0].statement))
 
-    def find_attributes(self) -> Iterator[LeftOver]:
+    def find_attributes(self) -> Iterator[FaultyCode]:
         """Yield attributes that begin an episode as the last one has left them, after its condition held in that."""
         tried = 0
         for key, assignments in self.definitions.assigned.items():
@@ -138,7 +128,7 @@ class LeftOvers:
         reads = [one for one in self.source.expressions if read_key(one.node) == key and one.function in self._steps]
         return not reads
 
-    def _try(self, key: str, assignment: Assignment, branch: Branch) -> LeftOver | None:
+    def _try(self, key: str, assignment: Assignment, branch: Branch) -> FaultyCode | None:
         number, episode = 0, self.noted.episodes[0]
         forced = {step: self._draws.force(branch) for step in range(FORCED_FROM, FORCED_FROM + FORCED_STEPS)}
         if len(episode) < 2 or len(self.noted.play(number, FORCED_FROM + FORCED_STEPS, forced)) < FORCED_FROM + 1:
@@ -154,7 +144,7 @@ class LeftOvers:
                     what = f"no reset sets {key} back: after an episode in which {text} was made"
                     what += f" {branch.tests[0][1]}, {one.text} begins the next one as {_show(value)} instead of"
                     what += f" {_show(first)}"
-                    return LeftOver(assignment.statement, what, self.source.find_place(assignment.statement))
+                    return FaultyCode(assignment.statement, what, self.source.find_place(assignment.statement))
         return None
 
 

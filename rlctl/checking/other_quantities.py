@@ -18,17 +18,7 @@ from rlctl.checking.term_names import split_name
 
 KINDS = {
     "distance": {
-        "near",
-        "nearness",
-        "dist",
-        "distance",
-        "close",
-        "closeness",
-        "reach",
-        "proximity",
-        "d",
-        "gap",
-        "range",
+        *("near", "nearness", "dist", "distance", "close", "closeness", "reach", "proximity", "d", "gap", "range"),
     },
     "heading": {"turn", "heading", "yaw", "bearing", "facing", "align", "aligned", "alignment", "direction"},
     "tilt": {"tilt", "upright", "level", "lean", "roll", "pitch"},
@@ -37,21 +27,8 @@ KINDS = {
 }
 """By which words quantities are called."""
 OTHER_WORDS = {
-    *(
-        "rate",
-        "cost",
-        "action",
-        "actions",
-        "effort",
-        "energy",
-        "torque",
-        "change",
-        "smooth",
-        "acc",
-        "progress",
-        "total",
-    ),
-    *("limit", "max", "min", "limits", "width", "scale", "sigma", "std", "tolerance", "tol"),
+    *("rate", "cost", "action", "actions", "effort", "energy", "torque", "change", "smooth", "acc", "progress"),
+    *("total", "limit", "max", "min", "limits", "width", "scale", "sigma", "std", "tolerance", "tol"),
 }
 """Words next to which the others may mean something else."""
 KERNELS = {"exp", "tanh", "closeness", "gauss", "gaussian", "rbf", "bell"}

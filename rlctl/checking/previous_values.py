@@ -127,12 +127,11 @@ class KeptDifferences:
     def is_paid_at(self, one: KeptDifference, number: int, step: int, forced: Mapping[int, Mapping[int, Any]]) -> bool:
         """Say whether another difference in a step of an episode changes the reward of this step."""
         value = next(iter(self.noted.episodes[number][step].values.get(one.whole.number, [0.0])))
-        rewards = []
-        for size in (0.0, FORCED):
-            set_to = np.full(np.shape(value), size) if isinstance(value, np.ndarray) else size
-            played = self.noted.play(number, step, {**forced, step: {one.whole.number: set_to}})
-            rewards.append(played[step][1].reward_number if len(played) > step else np.nan)
-        return bool(np.isfinite(rewards).all() and rewards[0] != rewards[1])
+        zero, large = (
+            {one.whole.number: np.full(np.shape(value), size) if isinstance(value, np.ndarray) else size}
+            for size in (0.0, FORCED)
+        )
+        return bool(self.noted.changes(number, step, zero, large, forced=forced))
 
 
 def is_previous_key(key: str) -> bool:

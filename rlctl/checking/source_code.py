@@ -39,6 +39,15 @@ class Expression:
         return self.file, self.node.lineno
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class FaultyCode:
+    """A piece of the source, and what is wrong with it."""
+
+    node: ast.stmt | ast.expr
+    what: str
+    where: tuple[str, int]  # file and line
+
+
 class SourceCode:
     """The modules of an environment's author: those of its classes, and of the same folder what they have imported."""
 

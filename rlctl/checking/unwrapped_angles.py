@@ -3,17 +3,18 @@
 import ast
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from rlctl.checking.assignments import read_key, read_name
 from rlctl.checking.definitions import ReadExpression
-from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.episode import Moment
+from rlctl.checking.experiments.expressions import NotedEpisodes, read_observation, read_reward
 from rlctl.checking.expressions import NotedCall, Number, Value
 from rlctl.checking.previous_values import list_changes
 from rlctl.checking.source_code import Expression
+from rlctl.checking.worlds import Array
 
 TURN = 2 * math.pi
 SLACK = 1.01  # a wrapped difference may be pi, and a little more by rounding
@@ -22,7 +23,7 @@ WRAPPED = {"arctan2", "atan2", "remainder", "angle"}
 NEAR_JUMP = 2.0  # of an angle that is wrapped, and jumps at pi [rad]
 FEWEST_CALLS = 10  # in which a side of a difference is what a sine is of
 SAME = 1e-9
-Changes = Callable[[int, int, Mapping[int, Any], Mapping[int, Any]], bool | None]
+ROUNDED = 1e-6  # a turn less has another sine in its last digits
 
 
 class UnwrappedAngles:
@@ -48,7 +49,7 @@ class UnwrappedAngles:
         """Yield differences that are paid, each with the largest one that was noted [rad]; what is wrapped may jump by
         a turn."""
         for one, largest in self._differences:
-            if self._matters(one, self.notes.changes_reward):
+            if self._matters(one, read_reward):
                 yield one, largest
 
     def find_shown(self) -> Iterator[tuple[Expression, float]]:
@@ -57,7 +58,7 @@ class UnwrappedAngles:
         for one, largest in self._differences:
             assert isinstance(one.node, ast.BinOp)
             turn_round = all(map(self._turns_round, (one.node.left, one.node.right)))
-            if largest > SLACK * math.pi and turn_round and self._matters(one, self.notes.changes_observation):
+            if largest > SLACK * math.pi and turn_round and self._matters(one, read_observation):
                 yield one, largest
 
     @functools.cached_property
@@ -129,7 +130,7 @@ class UnwrappedAngles:
         a, b = np.array(pairs, np.float64).reshape(len(pairs), 2, -1).transpose(1, 0, 2)
         return bool(np.abs(a - b).max() <= SAME and np.ptp(a, axis=0).min() > 0)
 
-    def _matters(self, one: Expression, changes: Changes) -> bool:
+    def _matters(self, one: Expression, read: Callable[[Moment], Array]) -> bool:
         """Say whether a turn less changes something of a step, one with a large difference if there are some."""
         steps = [
             (_size(value), number, call.step, value)
@@ -143,7 +144,7 @@ class UnwrappedAngles:
         if value is None:
             return False
         same, turned = ({one.number: given} for given in (value, _turn_back(value)))
-        return bool(changes(number, step, same, turned))
+        return bool(self.notes.changes(number, step, same, turned, read=read, tolerance=ROUNDED))
 
 
 def _list_values(one: Expression, calls: Sequence[NotedCall]) -> list[Value]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.assignments import read_key, read_name
-from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.experiments.expressions import NotedEpisodes, read_step
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.previous_values import (
     FEWEST_CHANGES,
@@ -22,7 +22,6 @@ from rlctl.checking.previous_values import (
     read_sides,
 )
 from rlctl.checking.source_code import Expression
-from rlctl.checking.values import flatten
 
 NO_CHANGES = {
     *("max", "min", "maximum", "minimum", "fmax", "fmin", "clip", "where", "allclose", "isclose", "array_equal"),
@@ -121,7 +120,7 @@ class ZeroDifferences:
         return largest <= ZERO * float(np.median(moving))
 
     def _shows(self, value: Expression) -> bool:
-        """Say whether another value of an expression in one step changes an observation or a reward soon after."""
+        """Say whether another value of an expression in one step changes what is seen of the steps soon after."""
         for number, episode in enumerate(self.noted.episodes):
             steps = [call.step for call in episode[1:] if value.number in call.values]
             if not steps:
@@ -130,16 +129,8 @@ class ZeroDifferences:
             before = episode[step].values[value.number][0]
             if before is None:
                 return False
-            played = [
-                [moment for _, moment in self.noted.play(number, step + LATER, forced)]
-                for forced in ({}, {step: {value.number: _move(before)}})
-            ]
-            pairs = list(zip(*(part[step:] for part in played), strict=False))
-            return any(
-                one.reward_number != other.reward_number
-                or not np.array_equal(flatten(one.observation), flatten(other.observation), equal_nan=True)
-                for one, other in pairs
-            )
+            moved = {value.number: _move(before)}
+            return bool(self.noted.changes(number, step, {}, moved, read=read_step, later=LATER))
         return False
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.episode import EpisodePlayer, Moment
@@ -30,8 +31,30 @@ EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
 LONGEST_S = 10.0  # for episodes that are played again [s]
-CHANGED = 1e-6  # relative and absolute: what differs by more has changed
 MOST_NOTED = 300_000  # values; no episode begins after so many
+
+
+def read_reward(moment: Moment) -> NDArray[np.float64]:
+    """Return the reward of a step as an array."""
+    return np.array([moment.reward_number])
+
+
+def read_observation(moment: Moment) -> NDArray[np.float64]:
+    """Return the numbers that a step shows."""
+    return np.asarray(flatten(moment.observation), np.float64)
+
+
+def read_step(moment: Moment) -> NDArray[np.float64]:
+    """Return what a step pays and shows, and whether it ends the episode."""
+    return np.concatenate([read_reward(moment), moment.flags, read_observation(moment)])
+
+
+def _are_comparable(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Say whether the same of both is finite, and something is."""
+    if one.shape != other.shape:
+        return False
+    is_finite = np.isfinite(one)
+    return bool(is_finite.any() and np.array_equal(is_finite, np.isfinite(other)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,26 +91,29 @@ class NotedEpisodes:
             self._times.append(read_clock() - began)
         return played
 
-    def changes_reward(self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any]) -> bool | None:
-        """Say whether a step of an episode pays otherwise where expressions are worth what `other` has, instead of what
-        `one` has; None where it cannot be played."""
-        return self._differ(number, step, one, other, lambda moment: moment.reward_number)
-
-    def changes_observation(
-        self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any]
+    def changes(
+        self,
+        number: int,
+        step: int,
+        one: Mapping[int, Any],
+        other: Mapping[int, Any],
+        *,
+        read: Callable[[Moment], NDArray[np.float64]] = read_reward,
+        forced: Mapping[int, Mapping[int, Any]] = {},
+        later: int = 0,
+        tolerance: float = 0.0,
     ) -> bool | None:
-        """Say the same of what a step shows."""
-        return self._differ(number, step, one, other, lambda moment: flatten(moment.observation))
+        """Say whether something that is read of a step of an episode, or of so many later ones, is another where
+        expressions are worth what `other` has in it, instead of what `one` has; None where that is not known.
 
-    def _differ(
-        self, number: int, step: int, one: Mapping[int, Any], other: Mapping[int, Any], read: Callable[[Moment], Any]
-    ) -> bool | None:
-        played = [self.play(number, step, {step: values}) for values in (one, other)]
-        if any(len(calls) <= step for calls in played):
+        `forced` has values of other steps, `tolerance` is relative and absolute.
+        """
+        played = [self.play(number, step + later, {**forced, step: values})[step:] for values in (one, other)]
+        pairs = [(read(before), read(after)) for (_, before), (_, after) in zip(*played, strict=False)]
+        if not pairs or not all(_are_comparable(before, after) for before, after in pairs):
             return None
-        before, after = (np.asarray(read(calls[step][1]), np.float64) for calls in played)
-        is_known = before.shape == after.shape and np.isfinite([before, after]).all()
-        return not np.allclose(before, after, rtol=CHANGED, atol=CHANGED) if is_known else None
+        close = functools.partial(np.allclose, rtol=tolerance, atol=tolerance, equal_nan=True)
+        return not all(close(before, after) for before, after in pairs)
 
     def share(self, reader: Callable[["NotedEpisodes"], Reader]) -> Reader:
         """Return what a class reads of the episodes, which is made once for all judges."""

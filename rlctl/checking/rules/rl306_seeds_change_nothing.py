@@ -1,17 +1,19 @@
 """RL306: seeds change nothing."""
 
+import ast
 import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.differences import compare
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.goal_starts import GoalStarts
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
-from rlctl.checking.source_code import write_code
+from rlctl.checking.source_code import FaultyCode, write_code
 
 RULE = Rule(
     "RL306",
@@ -31,15 +33,26 @@ RULE = Rule(
 )
 
 FEWEST_SEEDS = 4
+GENERATORS = {"default_rng", "RandomState"}
 
 
 @judges_expressions(RULE, decides=False)
 def _find_vain_draws(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     starts = noted.share(GoalStarts)
-    found = itertools.chain(starts.find_vain_draws(), starts.find_first_draws(), starts.find_fixed_generators())
+    found = itertools.chain(starts.find_vain_draws(), starts.find_first_draws(), _find_generators(noted))
     for one in itertools.islice(found, 1):
         evidence = {"element": write_code(one.node)}
         yield RuleFinding(RULE, one.what, evidence, Severity.WARNING, where=one.where)
+
+
+def _find_generators(noted: NotedEpisodes) -> Iterator[FaultyCode]:
+    """Yield generators that each reset makes from one number: they draw the same in each episode."""
+    for function in noted.functions:
+        for node in ast.walk(function) if function in noted.of_resets and function.name != "__init__" else ():
+            match node:
+                case ast.Call(func=called, args=[ast.Constant(value=int(seed))]) if read_name(called) in GENERATORS:
+                    what = f"{write_code(node)}: each reset draws what the seed {seed} gives, whatever its own seed is"
+                    yield FaultyCode(node, what, noted.source.find_place(node))
 
 
 @judges_records(RULE, "comparisons", "episodes", of_absence=True)

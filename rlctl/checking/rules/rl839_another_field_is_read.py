@@ -58,15 +58,15 @@ def _find_tangential_forces(noted: NotedEpisodes) -> Iterator[RuleFinding]:
 
 
 def _find_only_element(function: ast.AST, name: str) -> int | None:
-    """Return which element of an array a function reads, where it is one, and nothing else is done with the array."""
+    """Return which element of an array a function reads, where it is one, and nothing else is done with the array but
+    to give it to one call."""
+    reads = [node for node in ast.walk(function) if isinstance(node, ast.Name) and node.id == name]
+    inside: list[ast.expr] = []
     places: set[int] = set()
-    reads = 0
     for node in ast.walk(function):
         match node:
-            case ast.Subscript(value=ast.Name(id=read), slice=ast.Constant(value=int(place))) if read == name:
+            case ast.Subscript(value=owner, slice=ast.Constant(value=int(place))) if owner in reads:
+                inside.append(owner)
                 places.add(place)
-                reads += 1
-            case ast.Name(id=read, ctx=ast.Load()) if read == name:
-                reads -= 1
-    # Each element has a name of its own; one more is the argument of the call.
-    return places.pop() if len(places) == 1 and reads == -1 else None
+    others = [read for read in reads if read not in inside and isinstance(read.ctx, ast.Load)]
+    return places.pop() if len(places) == 1 and len(others) == 1 else None
