@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from rlctl.checking.assignments import Assignment, read_key, read_words
+from rlctl.checking.assignments import read_key, read_name, read_words
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.episode import Moment
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Value
 from rlctl.checking.goal_draws import is_draw
 from rlctl.checking.goal_starts import UNUSED
+from rlctl.checking.previous_values import is_goal
 from rlctl.checking.source_code import Expression, FaultyCode, Function, write_code
 from rlctl.checking.term_names import split_name
 from rlctl.checking.values import flatten
@@ -26,6 +27,11 @@ PHYSICAL_WORDS = {
 """What decides how a robot moves."""
 MEASURED_WORDS = {"bias", "noise", "sensor", "measured", "estimated", "std"}
 STEPS, EPISODES = 30, 2  # that are played with other draws
+FEWEST = 10  # steps of an episode that ends
+PLACING = {"resetJointState", "resetBasePositionAndOrientation", "resetBaseVelocity", "resetJointStatesMultiDof"}
+PLACED = {"qpos", "qvel"}  # of MuJoCo
+SET_BACK = {"mj_resetData", "mj_resetDataKeyframe", "resetSimulation", "restoreState"}
+"""What sets back the whole world."""
 MOST_TRIED = 4
 
 
@@ -39,6 +45,7 @@ class IdleDraws:
     def find(self) -> Iterator[FaultyCode]:
         """Yield what is computed for nothing, then draws that nothing reads, then those that change nothing."""
         yield from self._find_lost()
+        yield from self._find_set_back()
         yield from self._find_unread()
         yield from self._find_idle()
 
@@ -50,27 +57,72 @@ class IdleDraws:
                     what = f"{write_code(node)}: it is computed, and nothing gets it"
                     yield FaultyCode(node, what, self.source.find_place(node))
 
+    def _find_set_back(self) -> Iterator[FaultyCode]:
+        """Yield calls that set back the world after the robot was placed in it, and not again afterwards."""
+        for function in self._functions:
+            backs = [
+                statement
+                for statement in function.body
+                if isinstance(statement, ast.Expr)
+                and isinstance(statement.value, ast.Call)
+                and read_name(statement.value.func) in SET_BACK
+            ]
+            if not backs:
+                continue
+            place = function.body.index(backs[-1])
+            before = [
+                one for one in function.body[:place] if self._places(one, function) and self._draws(one, function)
+            ]
+            after = [one for one in function.body[place + 1 :] if self._places(one, function)]
+            if before and not after:
+                what = f"{write_code(backs[-1])} sets back what {write_code(before[-1])} has placed"
+                yield FaultyCode(backs[-1], what, self.source.find_place(backs[-1]))
+
+    def _places(self, statement: ast.stmt, function: Function) -> bool:
+        """Say whether a statement places something, also in functions that it calls."""
+        for top, _ in self.definitions.list_sources(statement, function):
+            for node in ast.walk(top):
+                is_field = isinstance(node, ast.Attribute) and node.attr in PLACED
+                if is_field and self._is_stored(node):
+                    return True
+                if isinstance(node, ast.Call) and read_name(node.func) in PLACING | {"set_state"}:
+                    return True
+        return False
+
+    def _is_stored(self, node: ast.AST) -> bool:
+        above = self.source.parents[node]
+        return isinstance(above, ast.Subscript) and above.value is node and isinstance(above.ctx, ast.Store)
+
     def _find_unread(self) -> Iterator[FaultyCode]:
         for function in self._functions:
             for text, several in self.definitions.list_assigned(function).items():
                 one = several[0]
-                if not self._draws(one) or one.is_part:
+                if not any(is_draw(node) for node in ast.walk(one.value)) or one.is_part:
                     continue
                 name = read_key(one.target) or text
                 if isinstance(one.target, ast.Name):
-                    is_unread = text not in UNUSED and not text.startswith("_") and not _is_name_read(function, text)
+                    is_unread = self._is_name_unread(function, text)
                 else:
                     is_unread = self._is_physical({name}) and not self._is_attribute_read(name)
                 if is_unread:
                     what = f"{write_code(one.statement)}: it is drawn, and nothing reads it"
                     yield FaultyCode(one.statement, what, self.source.find_place(one.statement))
 
-    def _draws(self, one: Assignment) -> bool:
-        return any(is_draw(node) for node in ast.walk(one.value))
+    def _draws(self, statement: ast.stmt, function: Function) -> bool:
+        """Say whether a statement has something that is drawn."""
+        tops = self.definitions.list_sources(statement, function)
+        return any(is_draw(node) for top, _ in tops for node in ast.walk(top))
 
     def _is_physical(self, keys: set[str]) -> bool:
         words = {word for key in keys for word in split_name(key)}
         return bool(words & PHYSICAL_WORDS) and not words & MEASURED_WORDS
+
+    def _is_name_unread(self, function: Function, name: str) -> bool:
+        """Say whether nothing reads a local name; RL306 has goals."""
+        nodes = [node for node in ast.walk(function) if isinstance(node, ast.Name) and node.id == name]
+        is_read = any(isinstance(node.ctx, ast.Load) for node in nodes)
+        is_outer = any(isinstance(node, ast.Global | ast.Nonlocal) for node in ast.walk(function))
+        return not is_read and not is_outer and name not in UNUSED and not name.startswith("_") and not is_goal(name)
 
     def _is_attribute_read(self, key: str) -> bool:
         return any(read_key(one.node) == key for one in self.source.expressions) or self._is_unpacked_elsewhere(key)
@@ -142,17 +194,12 @@ class IdleDraws:
                 for value in (values[number], values[number + 1])
             ]
             one, other = ([moment for _, moment in episode] for episode in played)
-            if len(one) < STEPS or [*map(_pay, one)] != [*map(_pay, other)]:
+            if len(one) < FEWEST or [*map(_pay, one)] != [*map(_pay, other)]:
                 return False
             if self._has_engine and not _see_same(one, other):
                 return False
-            moving |= len({_pay(moment) for moment in one[1:]}) > STEPS // 2
+            moving |= len({_pay(moment) for moment in one[1:]}) > len(one) // 2
         return moving
-
-
-def _is_name_read(function: Function, name: str) -> bool:
-    nodes = [node for node in ast.walk(function) if isinstance(node, ast.Name) and node.id == name]
-    return any(isinstance(node.ctx, ast.Load) for node in nodes)
 
 
 def _thaw(value: Value) -> Any:

@@ -3,7 +3,6 @@
 import ast
 import dataclasses
 import functools
-import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -51,20 +50,16 @@ class LateEvents:
             if one.function not in self.noted.of_steps:
                 continue
             if isinstance(one.node, ast.Compare) and self._is_event(one):
-                step = self._find_first(one)
+                step = self._find_first(one) if self._is_constant(one) else None
                 if step is not None and self._is_after_end(step):
-                    what = (
-                        f"{one.text} would change in step {step:.0f}, and an episode has {self._limit:.0f} steps: what"
-                    )
-                    yield FaultyCode(one.node, f"{what} it is for never comes", one.where)
+                    what = f"{one.text} would change in step {step:.0f}, and an episode has {self._limit:.0f} steps:"
+                    yield FaultyCode(one.node, f"{what} what it is for never comes", one.where)
                 elif self._stands(one):
                     what = f"{one.text} never holds: no step moves {ast.unparse(one.node.left)}"
                     yield FaultyCode(one.node, what, one.where)
             elif (step := self._find_part(one)) is not None and self._is_after_end(step):
-                what = (
-                    f"{one.text} comes to 1 in step {step:.0f}, and an episode has {self._limit:.0f} steps: all parts"
-                )
-                yield FaultyCode(one.node, f"{what} but the first never come", one.where)
+                what = f"{one.text} comes to 1 in step {step:.0f}, and an episode has {self._limit:.0f} steps:"
+                yield FaultyCode(one.node, f"{what} all parts but the first never come", one.where)
 
     def _is_after_end(self, step: float) -> bool:
         return self._limit is not None and self._limit < step < FAR * self._limit
@@ -89,8 +84,7 @@ class LateEvents:
         return min(found, default=None)
 
     def _find_first(self, one: Expression) -> float | None:
-        """Return in which step a comparison with a clock, which was never met, will hold, in the episode in which that
-        comes first."""
+        """Return in which step a comparison with a clock changes, in the episode in which that comes first."""
         match one.node:
             case ast.Compare(
                 left=ast.BinOp(left=left, op=ast.Mod(), right=right),
@@ -102,8 +96,6 @@ class LateEvents:
                 pass
             case _:
                 return None
-        if self._is_met(one) and not (self._is_choice(one.node) and self._always_holds(one)):
-            return None
         pairs = list(zip(self._read(left), self._read(right), strict=True))
         known = [(a, b) for a, b in pairs if a is not None and b is not None]
         if not known or len(known) < len(pairs) or not any(a.slope for a, _ in known):
@@ -149,6 +141,10 @@ class LateEvents:
         return len({ast.unparse(one) for one in entries}) == 2 and all(
             isinstance(one, ast.Subscript) for one in entries
         )
+
+    def _is_constant(self, one: Expression) -> bool:
+        """Say whether a condition never held; or always, where it chooses between two entries."""
+        return not self._is_met(one) or (self._is_choice(one.node) and self._always_holds(one))
 
     def _always_holds(self, one: Expression) -> bool:
         values = [value for call in self.noted.steps for value in call.values.get(one.number, ())]
@@ -228,13 +224,13 @@ def _is_rounding(call: ast.Call) -> bool:
 
 
 def _fit(values: Sequence[Value]) -> _Line | None:
-    """Return the line on which values are, one in each step; None for others."""
-    numbers = [
-        float(np.ravel(value)[0]) for value in values if value is not None and np.size(value) and not np.ptp(value)
-    ]
-    if len(numbers) < max(FEWEST, len(values)):
+    """Return the line on which the values of steps are; None for others. Some steps may not evaluate them."""
+    known = [(place, value) for place, value in enumerate(values) if value is not None]
+    numbers = [float(np.ravel(value)[0]) for _, value in known if np.size(value) and not np.ptp(value)]
+    if len(numbers) < max(FEWEST, len(known)):
         return None
-    changes = [after - before for before, after in itertools.pairwise(numbers)]
-    slope = float(np.mean(changes))
-    size = EXACT * (1 + max(map(abs, numbers)))
-    return _Line(numbers[0], slope if abs(slope) > EXACT * size else 0.0) if np.ptp(changes) < size else None
+    places = np.array([place for place, _ in known])
+    slopes = np.diff(numbers) / np.diff(places)
+    slope, size = float(np.mean(slopes)), EXACT * (1 + max(map(abs, numbers)))
+    slope = slope if abs(slope) > EXACT * size else 0.0
+    return _Line(numbers[0] - slope * int(places[0]), slope) if np.ptp(slopes) < size else None
