@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from rlctl.checking.assignments import Assignment, read_key, read_name, read_words
 from rlctl.checking.early_readings import NOMINAL_WORDS, EarlyReadings, Repeatable, RepeatWatch, differ
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.late_readings import MEANT_WORDS
+from rlctl.checking.late_readings import MEANT_WORDS, is_relative
 from rlctl.checking.observed_frames import ObservedCode
 from rlctl.checking.source_code import Expression
 from rlctl.checking.stale_values import FIRST_WORDS
@@ -20,7 +20,6 @@ COURSE_WORDS = {
 """What names a course, or a size, that is meant to be laid down at the start."""
 STATE_WORDS = {"velocity", "vel", "speed", "twist", "gyro", "gravity", "qvel"}
 """What names a measurement, however it is used."""
-TURNS = {"cos", "sin", "arctan2", "atan2", "rotate", "rotate_inverse", "matmul", "dot", "einsum"}
 EPISODES, STEPS = 3, 12  # that are played once more
 FEWEST = 2  # episodes in which it is another value: with actions of 0 a robot may stand still
 PASSED = (
@@ -66,21 +65,14 @@ class StartReadings:
             of_resets = [one for one in assignments if one.function in self.noted.of_resets]
             is_set = any(one.function in self.noted.of_steps for one in assignments)
             is_meant = read_words(key) & (FIRST_WORDS | MEANT_WORDS | NOMINAL_WORDS | COURSE_WORDS)
-            if len(of_resets) != 1 or is_set or is_meant or not self._is_relative(of_resets[0]):
+            if len(of_resets) != 1 or is_set or is_meant:
                 continue
-            read, repeatable = self._find_read(key), early.open(key, of_resets[0])
+            one = of_resets[0]
+            if not is_relative(self.definitions.list_sources(one.value, one.function)):
+                continue
+            read, repeatable = self._find_read(key), early.open(key, one)
             if read is not None and repeatable is not None:
                 yield repeatable, read
-
-    def _is_relative(self, one: Assignment) -> bool:
-        """Say whether a value is a difference, or is turned: seen from something."""
-        tops = self.definitions.list_sources(one.value, one.function)
-        return any(
-            (isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub | ast.MatMult))
-            or (isinstance(node, ast.Call) and read_name(node.func) in TURNS)
-            for top, _ in tops
-            for node in ast.walk(top)
-        )
 
     @functools.cached_property
     def _roots(self) -> list[ast.expr]:
