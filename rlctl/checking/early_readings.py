@@ -5,13 +5,13 @@ import contextlib
 import copy
 import dataclasses
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
-from rlctl.checking.assignments import Assignment, read_key, read_name, read_words
+from rlctl.checking.assignments import Assignment, read_key, read_name, read_root, read_words
 from rlctl.checking.definitions import Definitions
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
@@ -62,13 +62,15 @@ class EarlyReading:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Candidate:
+class Repeatable:
+    """What a reset keeps, and the expression of it that may be evaluated once more."""
+
     key: str
     assignment: Assignment
     value: Expression
     again: ast.expr  # the value, with what its local names stand for
     origins: list[Expression]  # of these names
-    differences: list[KeptDifference]
+    differences: Sequence[KeptDifference] = ()
 
 
 class EarlyReadings:
@@ -85,7 +87,7 @@ class EarlyReadings:
             return
         seen: dict[Expression, list[tuple[Any, Any]]] = {}
         for number in range(min(RESETS, len(self.noted.episodes))):
-            watch = _ResetWatch(self.noted, candidates)
+            watch = RepeatWatch(self.noted, candidates)
             with watch:
                 played = self.noted.play(number, 0, {})
             for one in candidates if played else ():
@@ -93,27 +95,32 @@ class EarlyReadings:
                     seen.setdefault(one.value, []).append(pair)
         for one in candidates:
             pairs = seen.get(one.value, [])
-            is_early = len(pairs) >= FEWEST and all(_differ(*pair) for pair in pairs[1:])
+            is_early = len(pairs) >= FEWEST and all(differ(*pair) for pair in pairs[1:])
             if is_early and self._is_meant(one, pairs) and (difference := self._find_used(one)) is not None:
                 yield EarlyReading(one.assignment, one.value, *pairs[-1], difference)
 
-    def _list_candidates(self) -> Iterator[_Candidate]:
+    def _list_candidates(self) -> Iterator[Repeatable]:
         subtracted = {one.key for one in self._differences}
         for key, assignments in self.definitions.assigned.items():
-            for one in assignments:
-                value = self.noted.source.find(one.value)
-                is_plain = one.element is None and not one.is_part and isinstance(one.statement, ast.Assign)
-                is_plain &= isinstance(one.target, ast.Attribute | ast.Subscript)
-                if key not in subtracted or value is None or not is_plain or one.function not in self.noted.of_resets:
-                    continue
-                opened = _OpenedNames(self.definitions, one)
-                again = opened.visit(copy.deepcopy(one.value))
-                if is_goal(key) or is_goal(read_key(one.value)) or not self._may_be_repeated(one, again):
-                    continue
-                origins = [found for node in opened.origins if (found := self.noted.source.find(node)) is not None]
-                if opened.is_known and self._is_pure(again):
+            for one in assignments if key in subtracted and not is_goal(key) else ():
+                found = self.open(key, one) if not is_goal(read_key(one.value)) else None
+                if found is not None:
                     its = [other for other in self._differences if other.key == key]
-                    yield _Candidate(key, one, value, again, origins, its)
+                    yield dataclasses.replace(found, differences=its)
+
+    def open(self, key: str, one: Assignment) -> Repeatable | None:
+        """Return what a reset keeps, with the expression that may be evaluated once more; None for what may not be."""
+        value = self.noted.source.find(one.value)
+        is_plain = one.element is None and not one.is_part and isinstance(one.statement, ast.Assign)
+        is_plain &= isinstance(one.target, ast.Attribute | ast.Subscript)
+        if value is None or not is_plain or one.function not in self.noted.of_resets:
+            return None
+        opened = _OpenedNames(self.definitions, one)
+        again = opened.visit(copy.deepcopy(one.value))
+        if not self._may_be_repeated(one, again) or not opened.is_known or not self._is_pure(again):
+            return None
+        origins = [found for node in opened.origins if (found := self.noted.source.find(node)) is not None]
+        return Repeatable(key, one, value, again, origins)
 
     def _may_be_repeated(self, assignment: Assignment, again: ast.expr) -> bool:
         """Say whether the names of an expression have the same values at the end of its function."""
@@ -134,6 +141,8 @@ class EarlyReadings:
                     return False
                 case ast.Call(func=function):
                     name = read_name(function)
+                    if read_root(function) in {"np", "numpy"} and name in {"append", "add", "setdiff1d"}:
+                        continue  # they return a new array
                     owners = set(split_name(ast.unparse(function)))
                     if not name or owners & CHANCE_WORDS or name in CLOCKS or name.lstrip("_").startswith(CHANGING):
                         return False
@@ -142,14 +151,14 @@ class EarlyReadings:
                         return False
         return True
 
-    def _is_meant(self, one: _Candidate, pairs: list[tuple[Any, Any]]) -> bool:
+    def _is_meant(self, one: Repeatable, pairs: list[tuple[Any, Any]]) -> bool:
         """Say whether a value is meant to be that of this episode: what is the same in all may be a nominal one."""
         words = read_words(one.key)
-        if any(_differ(pairs[0][0], kept) for kept, _ in pairs[1:]):
+        if any(differ(pairs[0][0], kept) for kept, _ in pairs[1:]):
             return True
         return bool(words & (START_WORDS | PREVIOUS_WORDS)) and not words & NOMINAL_WORDS
 
-    def _find_used(self, one: _Candidate) -> KeptDifference | None:
+    def _find_used(self, one: Repeatable) -> KeptDifference | None:
         """Return a difference of the first step that has what reset has kept."""
         for number in range(len(self.noted.episodes)):
             played = self.noted.play(number, 1, {})
@@ -159,7 +168,7 @@ class EarlyReadings:
             for difference in one.differences:
                 values = played[1][0].values.get(difference.kept.number)
                 if kept and values and kept[-1] is not None and values[0] is not None:
-                    return difference if not _differ(kept[-1], values[0], SAME) else None
+                    return difference if not differ(kept[-1], values[0], SAME) else None
         return None
 
 
@@ -188,10 +197,10 @@ class _OpenedNames(ast.NodeTransformer):
         return opened if one.element is None else ast.Subscript(opened, ast.Constant(one.element), ast.Load())
 
 
-class _ResetWatch(contextlib.AbstractContextManager["_ResetWatch"]):
-    """Evaluates what candidates keep once more, when the reset that has run them returns."""
+class RepeatWatch(contextlib.AbstractContextManager["RepeatWatch"]):
+    """Evaluates what candidates keep once more, each time that a reset or a step returns."""
 
-    def __init__(self, noted: NotedEpisodes, candidates: list[_Candidate]) -> None:
+    def __init__(self, noted: NotedEpisodes, candidates: list[Repeatable]) -> None:
         self._noted, self._candidates = noted, candidates
         self._functions = {
             (file, one.name, min([one.lineno, *(part.lineno for part in one.decorator_list)])): one
@@ -201,9 +210,9 @@ class _ResetWatch(contextlib.AbstractContextManager["_ResetWatch"]):
         }
         self._depth = 0
         self._scopes: dict[Function, tuple[dict[str, Any], dict[str, Any]]] = {}
-        self._found: dict[_Candidate, tuple[Any, Any]] = {}
+        self._found: dict[Repeatable, tuple[Any, Any]] = {}
 
-    def __enter__(self) -> "_ResetWatch":
+    def __enter__(self) -> "RepeatWatch":
         self._before = sys.getprofile()
         sys.setprofile(self._watch)
         return self
@@ -233,13 +242,18 @@ class _ResetWatch(contextlib.AbstractContextManager["_ResetWatch"]):
                 self._found[one] = _run(target, scope), _run(one.again, scope)
         self._noted.recorder.events = events
 
-    def read(self, one: _Candidate, call: NotedCall) -> tuple[Any, Any] | None:
+    def read_latest(self, one: Repeatable) -> tuple[Any, Any]:
+        """Return what an attribute is, and what its expression is worth, when the last call has returned; None for
+        what is not known."""
+        return self._found.get(one, (None, None))
+
+    def read(self, one: Repeatable, call: NotedCall) -> tuple[Any, Any] | None:
         """Return what was kept, and what the same expression was worth at the end; None where the attribute has been
         set again, or the physics has gone on."""
         if one not in self._found or one.value.number not in call.values:
             return None
         early, (kept, later) = call.values[one.value.number][-1], self._found[one]
-        if early is None or kept is None or later is None or _differ(early, kept, SAME):
+        if early is None or kept is None or later is None or differ(early, kept, SAME):
             return None
         latest = {number: place for place, (number, _) in enumerate(call.events)}
         first = min(latest.get(origin.number, len(call.events)) for origin in (one.value, *one.origins))
@@ -250,7 +264,7 @@ class _ResetWatch(contextlib.AbstractContextManager["_ResetWatch"]):
             return None
         return kept, later
 
-    def _moves_on(self, one: _Candidate, run: set[Function]) -> bool:
+    def _moves_on(self, one: Repeatable, run: set[Function]) -> bool:
         """Say whether one of the functions that were run moves the robot as steps do, such as to let it settle."""
         definitions = self._noted.definitions
         keys = definitions.list_reads(one.assignment.value, one.assignment.function)
@@ -268,7 +282,8 @@ def _run(node: ast.expr, scope: tuple[dict[str, Any], Mapping[str, Any]]) -> Any
     return value if np.isfinite(value).all() else None
 
 
-def _differ(one: Any, other: Any, part: float = OTHER) -> bool:
+def differ(one: Any, other: Any, part: float = OTHER) -> bool:
+    """Say whether numbers are others."""
     one, other = np.asarray(one, float), np.asarray(other, float)
     if one.shape != other.shape:
         return True

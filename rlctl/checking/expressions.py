@@ -23,6 +23,7 @@ from rlctl.checking.values import MOST_NUMBERS, NUMBERS
 
 NOTE = "__rlctl_note__"  # the name of the function that is called with each value
 MOST_EVENTS = 1_500_000
+MOST_PARTS = 20  # of a tuple whose numbers are noted together
 Number = float | NDArray[np.float64]
 Value = Number | None  # None for what is no number and no small array of numbers
 
@@ -218,4 +219,15 @@ def _freeze(value: Any) -> Value:
         and all(isinstance(one, NUMBERS) for one in value)
     ):
         return np.array(value, np.float64)
-    return None
+    return _flatten(value) if kind is tuple else None
+
+
+def _flatten(values: tuple[Any, ...]) -> Value:
+    """Return the numbers of a tuple of arrays and tuples, such as what a function returns; None for anything else."""
+    if len(values) > MOST_PARTS:
+        return None
+    parts = [_freeze(value) for value in values]
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts) or not parts or sum(map(np.size, known)) > MOST_NUMBERS:
+        return None
+    return np.concatenate([np.ravel(part) for part in known])

@@ -4,7 +4,7 @@ import ast
 import itertools
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -121,12 +121,21 @@ class GoalStarts:
         """Yield goals that only the first reset draws, as long as the environment lasts."""
         for _, assignments in self._list_goals():
             for one in assignments:
-                draws = [node for node in ast.walk(self._find_draw(one)) if is_draw(node)]
-                numbers = [found.number for node in draws if (found := self.source.find(node)) is not None]
-                is_first = any(number in self.resets[0].values for number in numbers)
-                is_later = any(number in call.values for call in self.resets[1:] for number in numbers)
-                if numbers and is_first and not is_later and len(self.resets) > 1:
+                draw = self._find_draw(one)
+                draws: list[ast.AST] = [node for node in ast.walk(draw) if is_draw(node)]
+                is_first = self._is_of_first_reset([one.value]) or self._is_of_first_reset(draws)
+                if is_first and self._draws_inside(one):
                     yield self._make(one.statement, "only the first reset draws this goal, and later ones keep it")
+
+    def _is_of_first_reset(self, nodes: Sequence[ast.AST]) -> bool:
+        """Say whether the first reset evaluates some of these expressions, and no later one does."""
+        numbers = [found.number for node in nodes if (found := self.source.find(node)) is not None]
+        times = [any(number in call.values for number in numbers) for call in self.resets]
+        return len(times) > 1 and times[0] and not any(times[1:])
+
+    def _draws_inside(self, one: Assignment) -> bool:
+        """Say whether what is assigned is drawn, also in functions that it calls."""
+        return any(self._draws(top) for top, _ in self.definitions.list_sources(one.value, one.function))
 
     def _find_draw(self, one: Assignment) -> ast.expr:
         for node in ast.walk(one.value):

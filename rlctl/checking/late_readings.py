@@ -30,9 +30,10 @@ DONE_WORDS = {"action", "actions", "torque", "torques", "ctrl", "effort"}
 STATES = {"qpos", "qvel", "mocap", "xfrc", "qfrc"}  # of MuJoCo
 ENGINE = (
     r"\b(qpos|qvel|qacc|xi?pos|xquat|xmat|cvel|sensordata|(site|geom)_x\w+|subtree_\w+|get(Base|Link|Joint|Contact)\w+"
-    r"|mj_object\w+|(base|link)_(position|orientation|velocity|angular_velocity)|joint_(positions|velocities))\b"
+    r"|mj_object\w+|mj_contactForce|ncon|data\.contact|(base|link)_(position|orientation|velocity|angular_velocity)|joint_(positions|velocities))\b"
 )
 """What MuJoCo, PyBullet and the robots of tasks return of the state."""
+TURNS = {"cos", "sin", "arctan2", "atan2", "rotate", "rotate_inverse", "matmul", "dot", "einsum"}
 DEEPEST = 3  # attributes that are computed from others
 FEWEST, MOST_CALLS = 20, 60  # steps
 NEARLY_ALL, SOME = 0.9, 0.1  # parts of them
@@ -94,9 +95,10 @@ class LateReadings:
     def _may_be_late(self, one: Assignment) -> bool:
         """Say whether a value follows from the state alone: from no action, no time, and not from what it was."""
         name = read_key(one.target) or read_name(one.target)
-        if not name or read_words(name) & (MEANT_WORDS | ACTION_WORDS | TIME_NAMES) or is_goal(name):
-            return False
         sources = self.definitions.list_sources(one.value, one.function)
+        is_meant = bool(read_words(name) & (MEANT_WORDS | ACTION_WORDS | TIME_NAMES))
+        if not name or is_meant or (is_goal(name) and not is_relative(sources)):
+            return False
         if any(self._is_meant(top, function) for top, function in sources):
             return False
         return name not in self._list_reads(one) and (bool(self._list_own_moves(one)) or self._reads_engine(one))
@@ -141,6 +143,9 @@ class LateReadings:
             for reads in [self._list_reads(one)]
         ]
         driven = {key for key, words, _ in assigned if words & DONE_WORDS}
+        for call, _ in self.definitions.calls["append"] + self.definitions.calls["put"]:  # to a queue
+            if isinstance(call.func, ast.Attribute) and any(list_name_words(arg) & DONE_WORDS for arg in call.args):
+                driven.add(read_key(call.func.value))
         for _ in range(DEEPEST):
             driven |= {key for key, _, reads in assigned if reads & driven}
         return driven
@@ -217,10 +222,29 @@ class LateReadings:
 
     @functools.cached_property
     def _observed(self) -> set[ast.AST]:
-        """The code of which the observation is made, also what is subtracted or turned for it."""
+        """The code of which the observation is made, also what is subtracted or turned for it, and what its local names
+        stand for."""
         turned = self.noted.turned
-        observed = ObservedCode(turned.series, self.definitions, turned.turns)
-        return {part for node in observed.nodes for part in ast.walk(node)}
+        waiting = list(ObservedCode(turned.series, self.definitions, turned.turns).nodes)
+        found = set[ast.AST]()
+        while waiting:
+            node = waiting.pop()
+            if node not in found:
+                found.add(node)
+                waiting += [part for part in ast.walk(node) if isinstance(part, ast.expr) and part not in found]
+                if isinstance(node, ast.Name):
+                    waiting += [*self.definitions.read(node), *self.definitions.read_parts(node)]
+        return found
+
+
+def is_relative(sources: Sequence[tuple[ast.AST, ast.AST]]) -> bool:
+    """Say whether a value is a difference, or is turned, by what it is computed from: seen from something."""
+    return any(
+        (isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub | ast.MatMult))
+        or (isinstance(node, ast.Call) and read_name(node.func) in TURNS)
+        for top, _ in sources
+        for node in ast.walk(top)
+    )
 
 
 def _is_same(one: Value, other: Value) -> bool:

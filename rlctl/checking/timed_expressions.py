@@ -11,20 +11,27 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from rlctl.checking.assignments import list_values
 from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.expressions import NotedCall, Value
+from rlctl.checking.named_times import (
+    extend_constants,
+    find_constants,
+    list_factors,
+    list_summands,
+    multiply_counts,
+    read_rate,
+    read_time,
+)
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable
-from rlctl.checking.source_code import Expression, SourceCode
-from rlctl.checking.step_times import SUBSTEP_WORDS, StepTimes, require_step_times
-from rlctl.checking.term_names import split_name
+from rlctl.checking.source_code import Expression, Function, SourceCode
+from rlctl.checking.step_times import StepTimes, require_step_times
 
-TIME_WORDS = {"dt", "timestep", "h", "ts"}
-RATE_WORDS = {"hz", "freq", "frequency", "fps", "rate"}
 FEWEST, SPANS = 10, 0.8  # steps; part of them in which a difference spans a whole step
 EXACT = 1e-6
 LONGEST_S = 1.0
+FULL_TURN = (1, 2, 1.0, 2.0)  # numbers in products that scale no time: 2 pi
+MOST_VALUES = 2  # in a step, of what does not change with each of its substeps
 FEWEST_ALIKE = 2  # lines that agree on how long a step takes
 TIMED = "timed expressions"
 """The fact with what `find_timed_expressions` returns."""
@@ -92,20 +99,10 @@ def find_majority(timed: Sequence[TimedExpression]) -> StepTimes | None:
 def find_timed_expressions(source: SourceCode, episodes: Sequence[Sequence[NotedCall]]) -> list[TimedExpression]:
     """Return where times are used that do not change."""
     steps = [call for episode in episodes for call in episode[1:]]
-    constants = _find_constants(source, [call for episode in episodes for call in episode])
-    found = [*_find_added(source, steps, constants), *_find_divided(source, steps, constants)]
+    constants = find_constants(source, [call for episode in episodes for call in episode])
+    found = [*_find_added(source, steps, extend_constants(source, constants))]
+    found += [*_find_multiplied(source, steps, constants), *_find_divided(source, steps, constants)]
     return [one for one in found if one.seconds <= LONGEST_S]
-
-
-def _find_constants(source: SourceCode, calls: Sequence[NotedCall]) -> dict[ast.expr, float]:
-    """Return the expressions that are always the same number."""
-    seen: dict[int, float] = {}
-    for call in calls:
-        for number, values in call.values.items():
-            for value in values:
-                if not isinstance(value, float) or seen.setdefault(number, value) != value:
-                    seen[number] = math.nan
-    return {source.expressions[number].node: value for number, value in seen.items() if not math.isnan(value)}
 
 
 def _find_added(
@@ -123,14 +120,15 @@ def _find_added(
             target, added = found
         if _is_of_loop(target, one):
             continue
-        for summand in _list_summands(added):
-            factors = _list_factors(summand, one)
-            times = [seconds for factor, _ in factors if (seconds := _read_time(factor, one, constants)) is not None]
+        for summand in list_summands(added):
+            factors = list_factors(summand, one)
+            times = [seconds for factor, _ in factors if (seconds := read_time(factor, one, constants)) is not None]
             if len(times) == 1:
                 is_clock = all(factor in constants or isinstance(factor, ast.Constant) for factor, _ in factors)
+                is_clock &= not isinstance(source.parents[summand], ast.Call)  # a limit of a change
                 use = Use.COUNTED if is_clock else Use.INTEGRATED
-                most = _count(source, one, target, steps)
-                seconds = times[0] * _multiply_counts(factors, one, constants)
+                most = _count(source, one, target, steps) or _count_conditions(source, one, steps)
+                seconds = times[0] * multiply_counts(factors, one, constants)
                 if most:
                     yield TimedExpression(use, ast.unparse(target), one.text, seconds, most, one.where)
 
@@ -161,87 +159,6 @@ def _is_of_loop(target: ast.expr, one: Expression) -> bool:
     return False
 
 
-def _list_summands(node: ast.expr) -> Iterator[ast.expr]:
-    """Yield the parts of a sum, also of the entries of an array."""
-    match node:
-        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
-            yield from _list_summands(left)
-            yield from _list_summands(right)
-        case ast.UnaryOp(operand=operand):
-            yield from _list_summands(operand)
-        case ast.Call(func=ast.Attribute(attr="array" | "asarray"), args=[ast.List(elts=entries), *_]):
-            for entry in entries:
-                yield from _list_summands(entry)
-        case _:
-            yield node
-
-
-def _list_factors(node: ast.expr, one: Expression) -> list[tuple[ast.expr, int]]:
-    """Return the factors of a product, each with its exponent: -1 of what it is divided by."""
-    match node:
-        case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return _list_factors(left, one) + _list_factors(right, one)
-        case ast.BinOp(op=ast.Div(), left=left, right=right) if not _is_named_time(node, one):
-            return [*_list_factors(left, one), (right, -1)]
-        case ast.Call(func=ast.Name(id="float"), args=[only]):
-            return _list_factors(only, one)
-    return [(node, 1)]
-
-
-def _multiply_counts(
-    factors: Sequence[tuple[ast.expr, int]], one: Expression, constants: Mapping[ast.expr, float]
-) -> float:
-    """Return the product of the factors that say how often something is repeated in a step."""
-    counts = [
-        constants[factor] ** exponent
-        for factor, exponent in factors
-        if constants.get(factor) and not isinstance(factor, ast.Constant) and _is_count(factor, one)
-    ]
-    return math.prod(counts)
-
-
-def _read_time(node: ast.expr, one: Expression, constants: Mapping[ast.expr, float]) -> float | None:
-    """Return the time that a part of an expression is, by what it is called [s]; None for anything else."""
-    value = constants.get(node)
-    return value if value is not None and value > 0 and _is_named_time(node, one) else None
-
-
-def _is_named_time(node: ast.expr, one: Expression) -> bool:
-    """Say whether names say that a part of an expression is a time: `dt`, `dt / substeps`, `1 / 240`, `1 / rate_hz`."""
-    match node:
-        case ast.BinOp(left=ast.Constant(), op=ast.Div(), right=right):
-            return bool(_words(right) & RATE_WORDS) or isinstance(right, ast.Constant)
-        case ast.BinOp(left=left, op=ast.Div(), right=right):
-            return _is_named_time(left, one) and _is_count(right, one)
-        case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return any(_is_named_time(a, one) and _is_count(b, one) for a, b in ((left, right), (right, left)))
-        case ast.Name(id=name):
-            assigned = list_values(one.function, name)
-            if len(assigned) == 1 and _is_named_time(assigned[0], one):
-                return True
-    words = _words(node)
-    return bool(words & TIME_WORDS) or words >= {"time", "step"}
-
-
-def _is_count(node: ast.expr, one: Expression) -> bool:
-    """Say whether a part of an expression is how often something is repeated."""
-    match node:
-        case ast.Constant(value=int()):
-            return True
-        case ast.Call(func=ast.Name(id="int" | "float"), args=[only]):
-            return _is_count(only, one)
-    return bool(_words(node) & SUBSTEP_WORDS)
-
-
-def _words(node: ast.expr) -> set[str]:
-    match node:
-        case ast.Attribute(attr=name) | ast.Name(id=name):
-            return set(split_name(name))
-        case ast.Subscript(slice=ast.Constant(value=str(name))):
-            return set(split_name(name))
-    return set()
-
-
 def _count(source: SourceCode, one: Expression, target: ast.expr, steps: Sequence[NotedCall]) -> int:
     """Return how often an expression is evaluated in a step at most, for each entry that it is added to."""
     index = source.find(target.slice) if isinstance(target, ast.Subscript) else None
@@ -255,23 +172,79 @@ def _count(source: SourceCode, one: Expression, target: ast.expr, steps: Sequenc
     return most
 
 
+def _count_conditions(source: SourceCode, one: Expression, steps: Sequence[NotedCall]) -> int:
+    """Return how often the condition is asked in a step, at most, under which an expression stands that no step has
+    reached."""
+    node: ast.AST = one.node
+    while not isinstance(node, Function):
+        node = source.parents[node]
+        if isinstance(node, ast.If | ast.IfExp) and (test := source.find(node.test)) is not None:
+            return max((len(call.values.get(test.number, ())) for call in steps), default=0)
+    return 0
+
+
+def _list_products(source: SourceCode) -> Iterator[tuple[Expression, list[tuple[ast.expr, int]]]]:
+    """Yield the products and quotients that are no part of another one, and their factors."""
+    for one in source.expressions:
+        above = source.parents.get(one.node)
+        if _is_product(one.node) and not (above is not None and _is_product(above)):
+            yield one, list_factors(one.node, one)
+
+
+def _is_product(node: ast.AST) -> bool:
+    return isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult | ast.Div)
+
+
+def _find_multiplied(
+    source: SourceCode, steps: Sequence[NotedCall], constants: Mapping[ast.expr, float]
+) -> Iterator[TimedExpression]:
+    """Yield a count of steps times a time."""
+    for one, factors in _list_products(source):
+        times = [
+            seconds for node, by in factors if by == 1 and (seconds := read_time(node, one, constants)) is not None
+        ]
+        counters = [node for node, by in factors if by == 1 and _counts_steps(source, node, steps)]
+        is_scaled = any(isinstance(node, ast.Constant) and node.value not in FULL_TURN for node, _ in factors)
+        if len(times) == 1 and len(counters) == 1 and not is_scaled:
+            seconds = times[0] * multiply_counts(factors, one, constants)
+            yield TimedExpression(Use.COUNTED, ast.unparse(counters[0]), one.text, seconds, 1, one.where)
+
+
+def _counts_steps(source: SourceCode, node: ast.expr, steps: Sequence[NotedCall]) -> bool:
+    """Say whether a number is the same in all of a step, and grows by 1 from step to step, or begins again."""
+    found = source.find(node)
+    values = [call.values.get(found.number, []) for call in steps] if found is not None else []
+    if any(len({repr(value) for value in one}) > 1 or not all(isinstance(v, float) for v in one) for one in values):
+        return False
+    numbers = [one[0] for one in values if one]
+    changes = [after - before for before, after in itertools.pairwise(numbers)]  # type: ignore[operator]
+    return sum(change == 1 for change in changes) >= FEWEST and all(change == 1 or change <= 0 for change in changes)
+
+
 def _find_divided(
     source: SourceCode, steps: Sequence[NotedCall], constants: Mapping[ast.expr, float]
 ) -> Iterator[TimedExpression]:
-    for one in source.expressions:
-        match one.node:
-            case ast.BinOp(left=left, op=ast.Div(), right=right):
-                seconds = _read_time(right, one, constants)
-            case _:
-                continue
-        differences = [source.find(node) for node in ast.walk(left) if _is_difference(node)]
-        if seconds is None or not differences:
+    for one, factors in _list_products(source):
+        times = [
+            seconds for node, by in factors if by == -1 and (seconds := read_time(node, one, constants)) is not None
+        ]
+        times += [seconds for node, by in factors if by == 1 and (seconds := read_rate(node, constants)) is not None]
+        tops = [node for node, by in factors if by == 1]
+        differences = [source.find(node) for top in tops for node in ast.walk(top) if _is_difference(node)]
+        if len(times) != 1 or not differences or not _is_once(one, steps):
             continue
-        most = max((len(call.values.get(one.number, ())) for call in steps), default=0)
+        seconds = times[0] / multiply_counts(factors, one, constants)
         for difference in differences:
-            if difference is not None and most == 1 and spans_steps(source, difference, steps):
-                yield TimedExpression(Use.DIVIDED, difference.text, one.text, seconds, most, one.where)
+            if difference is not None and spans_steps(source, difference, steps):
+                yield TimedExpression(Use.DIVIDED, difference.text, one.text, seconds, 1, one.where)
                 break
+
+
+def _is_once(one: Expression, steps: Sequence[NotedCall]) -> bool:
+    """Say whether an expression is worth the same each time in a step, or another number only where it is evaluated
+    before the robot moves."""
+    runs = [call.values[one.number] for call in steps if one.number in call.values]
+    return bool(runs) and all(len({repr(value) for value in run}) <= MOST_VALUES for run in runs)
 
 
 def _is_difference(node: ast.AST) -> bool:

@@ -43,6 +43,15 @@ SHOWN = {
         "RamTurnAsSpeed": ("RL839", "Ram"),
         "RamNormalAsPlace": ("RL839", "Ram"),
     },
+    "broken_idle.py": {
+        "RL815SkiffLooksOnce": ("RL815", "SkiffKnowsItsStart"),
+        "RL638SkiffShowsItsFirstGate": ("RL638", "Skiff"),
+        "RL842SkiffWithoutCurrent": ("RL842", "Skiff"),
+        "SkiffGustsTooLate": ("RL842", "SkiffGustsLate"),
+        "RL817SkiffGetsHeavier": ("RL817", "Skiff"),
+        "SkiffOfOneSeed": ("RL306", "Skiff"),
+        "SkiffOnOneCourse": ("RL306", "Skiff"),
+    },
     "broken_kernels.py": {
         "CartNearByTurning": ("RL643", "Cart"),
         "RL643CartAlignedByDistance": ("RL643", "CartOfTerms"),

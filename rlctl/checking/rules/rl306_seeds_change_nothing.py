@@ -14,6 +14,7 @@ from rlctl.checking.goal_starts import GoalStarts
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotJudged, Rule, RuleFinding, Severity
 from rlctl.checking.source_code import FaultyCode, write_code
+from rlctl.checking.term_names import split_name
 
 RULE = Rule(
     "RL306",
@@ -33,7 +34,10 @@ RULE = Rule(
 )
 
 FEWEST_SEEDS = 4
-GENERATORS = {"default_rng", "RandomState"}
+FEWEST_RESETS = 3  # with different seeds
+GENERATORS = {"default_rng", "RandomState", "Random", "np_random", "PCG64", "MT19937", "Philox", "SeedSequence"}
+SEED_WORDS = {"seed", "base", "default", "first", "initial", "last", "random", "rng", "start"}
+"""Of the names of a seed."""
 
 
 @judges_expressions(RULE, decides=False)
@@ -46,13 +50,42 @@ def _find_vain_draws(noted: NotedEpisodes) -> Iterator[RuleFinding]:
 
 
 def _find_generators(noted: NotedEpisodes) -> Iterator[FaultyCode]:
-    """Yield generators that each reset makes from one number: they draw the same in each episode."""
+    """Yield generators that each reset makes from one number, or seeds with one: they draw the same in each episode."""
     for function in noted.functions:
         for node in ast.walk(function) if function in noted.of_resets and function.name != "__init__" else ():
-            match node:
-                case ast.Call(func=called, args=[ast.Constant(value=int(seed))]) if read_name(called) in GENERATORS:
-                    what = f"{write_code(node)}: each reset draws what the seed {seed} gives, whatever its own seed is"
-                    yield FaultyCode(node, what, noted.source.find_place(node))
+            if not isinstance(node, ast.Call):
+                continue
+            seed = _read_seed(node)
+            if seed is not None and (number := _read_number(noted, seed)) is not None:
+                what = f"{write_code(node)}: each reset draws what the seed {number} gives, whatever its own seed is"
+                yield FaultyCode(node, what, noted.source.find_place(node))
+
+
+def _read_seed(call: ast.Call) -> ast.expr | None:
+    """Return from what a call makes or seeds a generator; None for other calls."""
+    name = read_name(call.func)
+    is_own_reset = name == "reset" and ast.unparse(call.func) == "super().reset"
+    if name in GENERATORS and call.args:
+        return call.args[0]
+    return next((word.value for word in call.keywords if word.arg == "seed"), None) if is_own_reset else None
+
+
+def _read_number(noted: NotedEpisodes, seed: ast.expr) -> int | None:
+    """Return the number that a seed is in each reset, where it is written so or called a seed; resets that were
+    played had different seeds."""
+    match seed:
+        case ast.Constant(value=int(number)):
+            return number
+        case ast.Name() | ast.Attribute() if {*split_name(read_name(seed))} <= SEED_WORDS:
+            found = noted.source.find(seed)
+            values = [
+                value
+                for episode in noted.episodes
+                for value in (episode[0].values.get(found.number, ()) if found else ())
+            ]
+            if len(values) >= FEWEST_RESETS and len({repr(value) for value in values}) == 1:
+                return int(values[0]) if isinstance(values[0], float) else None
+    return None
 
 
 @judges_records(RULE, "comparisons", "episodes", of_absence=True)

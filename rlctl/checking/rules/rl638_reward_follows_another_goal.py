@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rlctl.checking.action_trials import REWARD, Frame, Trials
 from rlctl.checking.experiment import INSTANCES, experiment
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.first_goals import FirstGoals
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED, ChildMessage
 from rlctl.checking.rule import NotApplicable, NotJudged, Rule, RuleFinding, Severity
@@ -27,7 +28,8 @@ RULE = Rule(
         while the same episode was played: in the same steps only one of them changed the observations, and only
         another one changed the rewards. Or reset copies a goal or a command into another attribute, and steps still
         read the copy after another one was drawn: the check let the condition be true under which that happens. Or only
-        the first reset computes a value, as under `if self.goal is None`, from another one that each reset sets.
+        the first reset computes a value, as under `if self.goal is None`, from another one that each reset sets. Or a
+        line reads the first of several goals, where others read the one that a counter or a clock says.
     """,
     fix="Choose the goal in one place, which the observation, the reward and the success read.",
 )
@@ -48,6 +50,9 @@ def _find_stale_copies(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in stale.find_first_only():
         message = f"only the first reset computes {one.copy} from {one.goal}, and each reset sets another {one.goal}:"
         message += f" {one.read.text} is that of the first episode"
+        yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
+    for one in FirstGoals(noted).find():
+        message = f"{one.read.text} stays that of the first goal, while {one.goal} goes on to the next ones"
         yield RuleFinding(RULE, message, {"element": one.copy}, where=one.read.where)
 
 

@@ -28,6 +28,7 @@ from rlctl.checking.readings import FEWEST_LOOKS, MOST_ELEMENTS, NEARLY_ALL, nam
 from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.shared_frames import name_elements, name_part
+from rlctl.checking.start_readings import StartReadings
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls
@@ -115,6 +116,13 @@ def _judge_lines(noted: NotedEpisodes) -> Iterator[RuleFinding]:
         evidence = {"element": one.read.text}
         same = ("RL115", "RL616", "RL617")  # all is late then
         yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_LINES, where=one.value.where, same=same)
+        return
+    for start in StartReadings(noted).find():
+        message = f"the observation has {start.read.text} (line {start.read.node.lineno}), and only a reset computes"
+        message += f" {start.value.text} for it: after some steps the same expression is worth something else"
+        place = noted.source.find_place(start.assignment.statement)
+        evidence = {"element": start.read.text, "call": "reset"}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_LINES, where=place)
         return
 
 

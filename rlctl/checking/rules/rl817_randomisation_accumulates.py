@@ -1,14 +1,19 @@
 """RL817: randomisation accumulates."""
 
+import ast
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
+from rlctl.checking.assignments import Assignment, peel, read_key, read_words
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import judges_resets
+from rlctl.checking.goal_draws import is_draw
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.source_code import write_code
 from rlctl.checking.worlds import Array
 from rlctl.environments.simulations import find_mujoco
 
@@ -18,8 +23,9 @@ RULE = Rule(
     Severity.ERROR,
     meaning="""
         Every reset changes a property of the MuJoCo model, such as a mass or a friction, as the last reset left
-        it, instead of its nominal value. Over many episodes it drifts away, and no episode can be repeated from
-        its seed.
+        it, instead of its nominal value; or an attribute such as self.mass, which a line of reset multiplies by a
+        draw, or adds one to, and which nothing sets back. Over many episodes it drifts away, and no episode can be
+        repeated from its seed.
     """,
     fix="""
         Keep a copy of the nominal values, self.mass = model.body_mass.copy() in the constructor, and write
@@ -33,8 +39,40 @@ PROPERTIES = {
     "actuator_gear": "actuator", "opt.gravity": "",
 }  # fmt: skip
 """Arrays of the model that are randomised."""
+LASTING_WORDS = {"level", "difficulty", "curriculum", "total", "count", "episode", "episodes", "seed"}
+"""What is meant to go on over resets."""
 SCALED = 1.5
 RESETS = 6
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    """Yield the first attribute that a reset computes from itself and a draw, and that nothing else sets."""
+    assigned = noted.definitions.assigned
+    for key, assignments in assigned.items():
+        of_episodes = [one for one in assignments if one.function in {*noted.of_resets, *noted.of_steps}]
+        owners = [other for other in assigned if key.startswith(f"{other}.")]
+        is_rebuilt = any(one.function in noted.of_resets for owner in owners for one in assigned[owner])
+        if len(of_episodes) == 1 and not is_rebuilt and not read_words(key) & LASTING_WORDS:
+            (one,) = of_episodes
+            if one.function in noted.of_resets and one.function.name != "__init__" and _grows(noted, one, key):
+                message = f"{write_code(one.statement)}: each reset changes {key} as the last one has left it"
+                place = noted.source.find_place(one.statement)
+                yield RuleFinding(RULE, message, {"element": key, "call": "reset"}, Severity.WARNING, where=place)
+                return
+
+
+def _grows(noted: NotedEpisodes, one: Assignment, key: str) -> bool:
+    """Say whether an attribute is multiplied by a draw, or gets one added."""
+    tops = noted.definitions.list_sources(one.value, one.function)
+    if not any(is_draw(node) for top, _ in tops for node in ast.walk(top)):
+        return False
+    match one.statement, peel(one.value):
+        case ast.AugAssign(), _:
+            return True
+        case ast.Assign(), ast.BinOp(left=left, right=right):
+            return key in (read_key(left), read_key(right))
+    return False
 
 
 @judges_resets(RULE)
