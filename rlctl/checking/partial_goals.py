@@ -50,9 +50,11 @@ class PartialGoalReader:
         rows = self._read_starts(goal.node)
         if rows is None:
             return None
+        lower, upper = (one.value if isinstance(one, ast.Constant) else None for one in (part.lower, part.upper))
+        if not isinstance(lower, int | None) or not isinstance(upper, int | None) or part.step is not None:
+            return None
         numbers = list(range(rows.shape[1]))
-        bounds = [one.value if isinstance(one, ast.Constant) else None for one in (part.lower, part.upper)]
-        used = numbers[slice(*bounds)]  # type: ignore[misc]
+        used = numbers[lower:upper]
         ranges = np.ptp(rows, axis=0)
         left = [one for one in numbers if one not in used and ranges[one] > CLEARLY * ranges.max()]
         return left[0] if left and used else None
