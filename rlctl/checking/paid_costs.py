@@ -10,6 +10,7 @@ from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, SIZES, read_summed
+from rlctl.checking.paid_goals import read_joined
 from rlctl.checking.products import list_product
 from rlctl.checking.summands import REWARD_NAMES, Summand
 from rlctl.checking.term_names import (
@@ -132,6 +133,7 @@ class CostReader:
         values = self._list_values(summand.place)
         if self.reward.numbers.read_constant(summand.place.node) is not None:
             tests = [test for test, is_true in summand.conditions if is_true]
+            tests += [part for test in tests for part in read_joined(test)]
             return any(isinstance(test, ast.Name) and _is_named_failure(test.id) for test in tests)
         is_flag = bool(values.size) and set(values.tolist()) <= {0.0, 1.0}
         words = self._list_words(summand)

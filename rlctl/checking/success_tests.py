@@ -9,11 +9,13 @@ import numpy as np
 from rlctl.checking.assignments import LIBRARIES, Assignment, list_name_words, read_key, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
+from rlctl.checking.goal_distances import TARGET_WORDS
 from rlctl.checking.paid_errors import (
     COMMAND_WORDS,
     EARLIER_WORDS,
     FEWEST,
     PART,
+    SIZES,
     WANTED_WORDS,
     Numbers,
     read_summed,
@@ -162,7 +164,7 @@ class SuccessTests:
             words |= list_name_words(one.node)
             match one.node:
                 case ast.BinOp(left=left, op=ast.Sub(), right=right):
-                    wanted = [bool(list_name_words(side) & WANTED_WORDS) for side in (left, right)]
+                    wanted = [bool(list_name_words(side) & TARGET_WORDS) for side in (left, right)]
                     if sum(wanted) == 1 and not words & (OTHER_WORDS | EARLIER_WORDS):
                         return True
         return bool(words & SIGNED_WORDS) and not words & (OTHER_WORDS | EARLIER_WORDS)
@@ -194,31 +196,40 @@ class SuccessTests:
         """Say whether a comparison is true where an error is small, or the cosine of one is large."""
         match place.node:
             case ast.Compare(left=left, ops=[operator], comparators=[right]):
-                values = self.notes.reward.numbers.list_values(left)
                 tolerance = self._read_tolerance(right)
-                if tolerance is None or values.size < FEWEST:
+                known = self._list_episodes(place.at(left))
+                values = np.concatenate([np.zeros(0), *known])
+                is_called = isinstance(left, ast.Call)
+                if tolerance is None:
                     return False
                 if isinstance(operator, ast.Lt | ast.LtE):
+                    is_size = is_called and read_name(left.func) in SIZES  # type: ignore[attr-defined]
+                    if values.size < FEWEST:  # what stands behind `and`, and was never evaluated
+                        return bool(is_size)
                     is_error = bool(values.min() >= 0) or self._should_be_small(place.at(left))
                     return is_error and float(np.ptp(values)) > 0
-                is_cosine = float(np.abs(values).max()) <= 1 + 1e-6 and bool(values.min() < 0)
-                return isinstance(operator, ast.Gt | ast.GtE) and is_cosine and 0.5 <= tolerance < 1
+                is_cosine = is_called and read_name(left.func) == "cos"  # type: ignore[attr-defined]
+                if values.size >= FEWEST:
+                    is_cosine |= float(np.abs(values).max()) <= 1 + 1e-6 and bool(values.min() < 0)
+                return isinstance(operator, ast.Gt | ast.GtE) and bool(is_cosine) and 0.5 <= tolerance < 1
         return False
 
     def _read_sides(self, place: ReadExpression) -> tuple[str, str]:
         assert isinstance(place.node, ast.Compare)
         return ast.unparse(place.node.left), ast.unparse(place.node.comparators[0])
 
-    def find_any(self) -> Iterator[tuple[ReadExpression, ReadExpression]]:
+    def find_any(self) -> Iterator[ReadExpression]:
         """Yield where one small number of an array is enough, although the reward adds up all of them."""
-        for place, test in self.anys:
+        smallest = [(test, test) for test in self.tests if _read_smallest(test.node) is not None]
+        for place, test in (*self.anys, *smallest):
             if not self._is_small(test) or not isinstance(test.node, ast.Compare):
                 continue
-            error = ast.unparse(self.definitions.resolve(test.at(test.node.left)).node)
+            whole = _read_smallest(test.node) or test.node.left
+            error = ast.unparse(self.definitions.resolve(test.at(whole)).node)
             for walked in self._walked:
                 sums = [one.at(inner) for one in walked if (inner := read_summed(one.node)) is not None]
                 if any(ast.unparse(part.node) == error for one in sums for part in self.definitions.walk(one)):
-                    yield place, test
+                    yield place
                     return
 
     @property
@@ -242,6 +253,17 @@ def read_reduced(call: ast.Call) -> ast.expr | None:
     if isinstance(call.func, ast.Attribute) and read_name(call.func.value) not in ("np", "numpy", "jnp"):
         return call.func.value
     return call.args[0] if call.args else None
+
+
+def _read_smallest(node: ast.expr) -> ast.expr | None:
+    """Return the array whose smallest number is compared, as in `x.min() < tolerance`."""
+    match node:
+        case ast.Compare(left=ast.Call(func=function) as call, ops=[ast.Lt() | ast.LtE()]) if read_name(function) in (
+            "min",
+            "amin",
+        ):
+            return read_reduced(call) if len(call.args) < 2 else None
+    return None
 
 
 def _is_true(one: Assignment) -> bool:

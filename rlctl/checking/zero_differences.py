@@ -2,13 +2,14 @@
 
 import ast
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeGuard
 
 import numpy as np
 
-from rlctl.checking.assignments import read_key, read_name
+from rlctl.checking.assignments import list_name_words, read_key, read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes, read_step
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.previous_values import (
@@ -78,6 +79,20 @@ class ZeroDifferences:
                 if is_same and is_before and not {read_key(origin) or read_name(origin), one.key} & changed:
                     return True
         return False
+
+    def find_same_sides(self) -> Iterator[Expression]:
+        """Yield paid differences of an expression and itself."""
+        for one in self.noted.source.expressions:
+            match one.node:
+                case ast.BinOp(left=left, op=ast.Sub(), right=right) if ast.dump(left) == ast.dump(right):
+                    is_drawn = bool(list_name_words(left) & {"random", "rng", "noise", "normal", "uniform"})
+                    if not is_drawn and one.node in self._walked:
+                        yield one
+
+    @functools.cached_property
+    def _walked(self) -> set[ast.expr]:
+        summands, definitions = self.noted.reward.summands, self.noted.reward.definitions
+        return {place.node for summand in summands for place in definitions.walk(summand.place)}
 
     def find_observed(self) -> Iterator[KeptDifference]:
         """Yield differences that are 0 in each step, and that only the observation is computed from."""

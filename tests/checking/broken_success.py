@@ -59,6 +59,11 @@ class BoatMoorsWithOneOfThem(BoatMoorsFully):
         return (errors < 0.2).any()
 
 
+class BoatMoorsByTheSmallerOne(BoatMoorsFully):
+    def fits(self, errors):
+        return errors.min() < 0.2
+
+
 class BoatTurnsSlowly(Boat):
     """It is paid for being near its buoy, and pays for turning."""
 
@@ -143,3 +148,18 @@ class BoatTurnsOnSinceTheStart(BoatTurnsOn):
     def reward(self):
         turns = self.speed[1] > 0
         return 0.1 * (turns ^ self.last_turns) - self.distance()
+
+
+class BoatTurnsFromItself(BoatTurnsSlowly):
+    def reward(self):
+        return -self.distance() - 0.1 * (self.speed[1] - self.speed[1]) ** 2
+
+
+class BoatKeepsCourse(BoatShowsItsError):
+    def reward(self):
+        return 0.2 * np.exp(-(self.error() ** 2)) - self.distance()
+
+
+class BoatLeavesItsCourse(BoatKeepsCourse):
+    def reward(self):
+        return 0.2 * np.exp((-self.error()) ** 2) - self.distance()

@@ -42,10 +42,10 @@ def _read_success(notes: NotedEpisodes) -> Iterator[RuleFinding]:
         message += " large the other error is"
         yield RuleFinding(RULE, message, {"element": ast.unparse(place.node)}, where=notes.reward.locate(place))
         return
-    for place, test in tests.find_any():
-        message = f"{ast.unparse(place.node)} is a part of success: one number of {ast.unparse(test.node)} is enough,"
-        message += " and the reward adds up all of them"
-        yield RuleFinding(RULE, message, {"element": ast.unparse(place.node)}, where=notes.reward.locate(place))
+    for place in tests.find_any():
+        text = ast.unparse(place.node)
+        message = f"{text} is a part of success: one small number is enough, and the reward adds up all of them"
+        yield RuleFinding(RULE, message, {"element": text}, where=notes.reward.locate(place))
         return
     for partial in PartialGoalReader(notes).find():
         text = ast.unparse(partial.place.node)
