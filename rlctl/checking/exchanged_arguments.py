@@ -8,8 +8,9 @@ from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rlctl.checking.assignments import list_parameters, read_name
+from rlctl.checking.assignments import LIBRARIES, list_parameters, read_name, read_root
 from rlctl.checking.definitions import bind
 from rlctl.checking.experiments.expressions import NotedEpisodes, read_step
 from rlctl.checking.source_code import Expression
@@ -19,6 +20,7 @@ LOW_WORDS, HIGH_WORDS = {"low", "lower", "lo", "min", "minimum"}, {"high", "uppe
 SYMMETRIC_WORDS = {"left", "right", "first", "second", "one", "two", "a", "b"}
 """Of parameters that are exchanged on purpose."""
 SHORTEST = 3  # letters of a name that says what it is
+CLIPPED = ("a", "min", "max")  # the parameters of NumPy's function; a method has no first one
 FEWEST = 3  # calls in which a limit is seen
 
 
@@ -60,6 +62,9 @@ class CallReader:
         """Return what a call gives to parameters whose names are known."""
         if any(isinstance(argument, ast.Starred) for argument in call.args):
             return {}
+        if read_name(call.func) == "clip" and isinstance(call.func, ast.Attribute):
+            is_method = read_root(call.func.value) not in LIBRARIES
+            return bind(call, [*CLIPPED[is_method:]])
         own = self.definitions.find_function(read_name(call.func))
         return bind(call, list_parameters(own) if own is not None else self._list_foreign(call.func))
 
@@ -87,10 +92,18 @@ class CallReader:
         words = set(split_name(low)), set(split_name(high))
         if not words[0] & LOW_WORDS or not words[1] & HIGH_WORDS or words[0] - LOW_WORDS != words[1] - HIGH_WORDS:
             return False
-        lows, highs = (self.notes.reward.numbers.list_values(given[name]) for name in (low, high))
-        if lows.size != highs.size or lows.size < FEWEST:
+        lows, highs = (self._list_limits(given[name]) for name in (low, high))
+        if not (lows.size == highs.size >= FEWEST or (1 in (lows.size, highs.size) and lows.size * highs.size)):
             return False
         return bool((lows >= highs).all() and (lows > highs).any())
+
+    def _list_limits(self, node: ast.expr) -> NDArray[np.float64]:
+        """Return what a limit was worth in all calls, or the number that it always is."""
+        constant = self.notes.reward.numbers.read_constant(node)
+        values = self.notes.reward.numbers.list_values(node)
+        if constant is not None:
+            return np.array([constant])
+        return values if values.size >= FEWEST else np.zeros(0)
 
     def _are_names_exchanged(self, one: str, other: str, given: Mapping[str, ast.expr]) -> bool:
         """Say whether both arguments have the names of each other's parameters, and their order matters."""

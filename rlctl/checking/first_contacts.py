@@ -7,14 +7,18 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.assignments import read_key
-from rlctl.checking.definitions import Definitions
+from rlctl.checking.assignments import list_name_words, read_key
+from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.source_code import Expression
 
 FEWEST_STAYS = 20  # steps in which a contact goes on
+FEWEST_LANDINGS = 5
 EXACT = 1e-6
+CONTACT_WORDS = {"contact", "contacts", "touch", "touches", "touching"}
+DISTANCE_WORDS = {"dist", "distance", "depth", "gap", "time", "last", "index", "geom", "geom1", "geom2", "id", "link"}
+"""What a contact has that may be below 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +46,40 @@ def find_endless_landings(noted: NotedEpisodes) -> Iterator[EndlessLanding]:
         values = np.array(stays)
         if len(values) >= FEWEST_STAYS and values[0] > 0 and np.allclose(values, values[0], rtol=EXACT, atol=0):
             yield EndlessLanding(key, comparison.text, comparison.where, float(values[0]), len(values))
+
+
+def find_missed_landings(noted: NotedEpisodes) -> Iterator[EndlessLanding]:
+    """Yield conditions `contact and time > 0` that never hold, although contacts begin after a time in the air: that
+    time has been set to 0 before."""
+    for contact, comparison, time, key in _list_conditions(noted, noted.definitions):
+        begun, longest, is_met = 0, 0.0, False
+        for episode in noted.episodes:
+            touching, times = _read(contact, time, episode[1:])
+            if len(touching):
+                begun += int((touching[1:] & ~touching[:-1] & (times[:-1] > 0)).sum())
+                longest = max(longest, float(times.max()))
+                is_met |= bool((touching & (times > 0)).any())
+        if begun >= FEWEST_LANDINGS and not is_met:
+            yield EndlessLanding(key, comparison.text, comparison.where, longest, begun)
+
+
+def find_counts_of_any_size(noted: NotedEpisodes) -> Iterator[Expression]:
+    """Yield comparisons that ask whether a number or a force of contacts is at least 0, which always holds."""
+    for one in noted.source.expressions:
+        match one.node:
+            case ast.Compare(left=count, ops=[ast.GtE()], comparators=[zero]):
+                pass
+            case ast.Compare(left=zero, ops=[ast.LtE()], comparators=[count]):
+                pass
+            case _:
+                continue
+        values = noted.reward.numbers.list_values(count)
+        if noted.reward.numbers.read_constant(zero) != 0 or values.size < FEWEST_STAYS or values.min() < 0:
+            continue
+        origin = noted.definitions.resolve(ReadExpression(count, one.function))
+        words = list_name_words(count) | list_name_words(origin.node)
+        if words & CONTACT_WORDS and not words & DISTANCE_WORDS:
+            yield one
 
 
 def _list_conditions(

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.definitions import Definitions
+from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.expressions import NotedCall
+
+MOST_HOPS = 6  # names that are followed to a value
 
 
 class NotedNumbers:
@@ -64,6 +66,20 @@ class NotedNumbers:
         found = [value for call in self.calls for value in call.values.get(one.number, [])] if one is not None else []
         numbers = [np.ravel(value) for value in found if value is not None]
         return np.concatenate(numbers) if numbers else np.zeros(0)
+
+    def list_arrays(self, place: ReadExpression) -> list[NDArray[np.float64]]:
+        """Return what an expression was worth each time. The owner of an index, `x` of `x[0]`, is not noted itself:
+        then it is what it stands for."""
+        for _ in range(MOST_HOPS):
+            one = self.source.find(place.node)
+            found = [value for call in self.calls for value in call.values.get(one.number, ())] if one else []
+            if found:
+                return [np.asarray(value) for value in found if value is not None]
+            followed = self.definitions.follow(place)
+            if len(followed) != 1:
+                break
+            place = followed[0]
+        return []
 
     def read_nth(self, node: ast.expr, order: int, count: int) -> float:
         """Return a number that is evaluated `count` times in a call, at one of these times; NaN if it is not."""

@@ -1,11 +1,13 @@
 """Summands of a reward that rise with the distance to what is to be reached, whatever function they are of it."""
 
+import ast
 import dataclasses
 import math
 from collections.abc import Iterator
 
 import numpy as np
 
+from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall
@@ -45,6 +47,28 @@ class RiseReader:
                 found = self._describe(one)
                 if found is not None:
                     yield found
+
+    def find_paid(self) -> Iterator[tuple[GoalDistance, Summand]]:
+        """Yield summands that are a distance itself, or a function that rises with it, and are added: also those that
+        count only where something is true that steps hardly ever reach."""
+        for one in self.notes.share(DistanceReader).distances:
+            for summand in one.summands:
+                place = self.notes.definitions.resolve(summand.place)
+                if summand.weight > 0 and not self.goals.is_of_progress(summand) and self._is_function(place, one):
+                    yield one, summand
+
+    def _is_function(self, place: ReadExpression, one: GoalDistance) -> bool:
+        """Say whether an expression is a distance, times a constant, or the hyperbolic tangent or the root of it."""
+        place = self.notes.definitions.resolve(place)
+        if place.node is one.expression.node:
+            return True
+        match place.node:
+            case ast.Call(func=function, args=[inner]) if read_name(function) in ("tanh", "sqrt", "log1p", "float"):
+                return self._is_function(place.at(inner), one)
+            case ast.BinOp(left=left, op=ast.Mult() | ast.Div(), right=right):
+                constants = [self.notes.reward.numbers.read_constant(side) is not None for side in (left, right)]
+                return sum(constants) == 1 and self._is_function(place.at(right if constants[0] else left), one)
+        return False
 
     def _pay(self, one: GoalDistance, number: int, last: int, part: float, lasting: int = LASTING) -> float:
         return self.forced.pay(number, last, {one.expression.number: part * one.largest}, lasting)[0]

@@ -108,10 +108,31 @@ class ErrorReader:
                         values = self.reward.numbers.list_values(base)
                         if values.size < FEWEST or np.abs(values).max() > 1 + 1e-6 or not (values < 0).mean() > PART:
                             continue
-                        if self._is_cosine(place.at(base)) and ast.unparse(base) in self._directed:
+                        if self.is_cosine(place.at(base)) and ast.unparse(base) in self._directed:
                             yield summand, place.at(base)
 
-    def _is_cosine(self, place: ReadExpression) -> bool:
+    def find_growing(self) -> Iterator[tuple[Summand, ReadExpression]]:
+        """Yield paid exponentials of sizes, which are smallest where the size is 0: a minus is missing."""
+        for summand in self.reward.summands:
+            for factor in list_product(summand.place.node) if summand.weight > 0 else ():
+                place = self.definitions.resolve(summand.place.at(factor))
+                place = place.at(read_summed(place.node) or place.node)
+                match place.node:
+                    case ast.Call(func=function, args=[only]) if read_name(function) == "exp":
+                        values, given = (self.reward.numbers.list_values(node) for node in (place.node, only))
+                        is_size = given.size >= FEWEST and given.min() >= 0 and self._has_size(place.at(only))
+                        if is_size and (values > 1 + CLEAR).mean() > PART:
+                            yield summand, place
+
+    def _has_size(self, place: ReadExpression) -> bool:
+        return any(
+            (isinstance(one.node, ast.Call) and read_name(one.node.func) in SIZES)
+            or (isinstance(one.node, ast.BinOp) and isinstance(one.node.op, ast.Pow))
+            for one in self.definitions.walk(place)
+        )
+
+    def is_cosine(self, place: ReadExpression) -> bool:
+        """Say whether it is computed as a cosine, or a scalar product, or is the last number of a matrix."""
         node = self.definitions.resolve(place).node
         match node:
             case ast.BinOp(op=ast.MatMult()):
@@ -128,6 +149,8 @@ class ErrorReader:
             return
         for factor in list_product(summand.place.node):
             place = self.definitions.resolve(summand.place.at(factor))
+            while isinstance(place.node, ast.BinOp) and isinstance(place.node.op, ast.Pow):
+                place = self.definitions.resolve(place.at(place.node.left))
             match place.node:
                 case ast.Call(func=function, args=[only]) if read_name(function) == "exp" and not summand.weight < 0:
                     values = self.reward.numbers.list_values(place.node)
@@ -165,6 +188,10 @@ class ErrorReader:
                         texts.append(ast.unparse(inner))
                         texts.append(ast.unparse(resolved.node))
                         yield sign, resolved
+            case ast.Subscript(value=owner) if not self.definitions.follow(place):
+                whole = self.definitions.resolve(place.at(owner))
+                if isinstance(whole.node, ast.BinOp) and isinstance(whole.node.op, ast.Sub):
+                    yield sign, whole
             case _:
                 found = self.definitions.follow(place)
                 if len(found) == 1:

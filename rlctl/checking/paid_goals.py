@@ -7,12 +7,14 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from rlctl.checking.assignments import list_name_words, read_name
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.paid_errors import EARLIER_WORDS, FEWEST, WANTED_WORDS, ErrorReader, read_summed
 from rlctl.checking.summands import SUMS, Summand
-from rlctl.checking.term_names import is_about_time, split_name
+from rlctl.checking.term_names import COST_WORDS, is_about_time, split_name
 
 AVOIDED_WORDS = {
     "agent", "avoid", "avoidance", "barrier", "border", "boundary", "bounds", "clearance", "cliff", "collision",
@@ -27,6 +29,8 @@ NEAR_WORDS = {
     "align", "alignment", "approach", "close", "closeness", "near", "proximity", "reach", "reaching", "track",
     "tracking",
 }  # fmt: skip
+ALIGNED_WORDS, UPRIGHT_WORDS = {"align", "aligned", "alignment", "facing"}, {"up", "upright", "uprightness"}
+UPRIGHT = 0.9  # cosine at the start
 DISTANCES = {"norm", "hypot", "dist", "distance", "sqrt"}
 KERNELS = {"exp", "closeness", "arrival"}
 SUCCESS_KEYS = {"is_success", "success"}
@@ -36,6 +40,7 @@ class WrongSign(enum.StrEnum):
     """How the sign of a summand is wrong."""
 
     NEARNESS_COSTS = "nearness costs"
+    ALIGNMENT_COSTS = "a cosine that is 1 where all is aligned costs"
     LEAVING_PAYS = "leaving pays"
 
 
@@ -65,6 +70,8 @@ class GoalReader:
                 words = self._list_words(summand)
                 if words & (NEAR_WORDS | WANTED_WORDS):
                     yield PaidDistance(WrongSign.NEARNESS_COSTS, summand, summand.place)
+            elif summand.weight < 0 and self._is_alignment(summand):
+                yield PaidDistance(WrongSign.ALIGNMENT_COSTS, summand, summand.place)
         for summand in self.reward.differences:
             if not self._is_avoided(summand) and self._pays_leaving(summand):
                 yield PaidDistance(WrongSign.LEAVING_PAYS, summand, summand.place)
@@ -94,6 +101,19 @@ class GoalReader:
                 summed = read_summed(resolved.node)
                 return summed is not None and self._is_nearness(resolved.at(summed))
         return False
+
+    def _is_alignment(self, summand: Summand) -> bool:
+        """Say whether it is a cosine that is called after what it is large for: an alignment, or standing upright."""
+        names = {word for name in (summand.name, *summand.names) for word in split_name(name)}
+        place = self.definitions.resolve(summand.place)
+        values = self.reward.numbers.list_values(place.node)
+        if values.size < FEWEST or np.abs(values).max() > 1 + 1e-6 or not float(np.ptp(values)) > 0:
+            return False
+        is_cosine = self.errors.is_cosine(place) and not isinstance(summand.place.node, ast.BinOp)
+        is_angle = isinstance(place.node, ast.Call) and read_name(place.node.func) == "cos"
+        is_upright = bool(names & UPRIGHT_WORDS) and not is_angle and values[0] > UPRIGHT
+        is_named = bool(names & ALIGNED_WORDS) or is_upright
+        return is_cosine and is_named and not names & COST_WORDS and not self.is_of_progress(summand)
 
     def is_of_progress(self, summand: Summand) -> bool:
         """Say whether another summand takes away what this one was a step before."""
@@ -173,8 +193,7 @@ class GoalReader:
         success = self.read_success()
         parts = [success] if success is not None else []
         for part in parts:
-            if isinstance(part.node, ast.BoolOp) and isinstance(part.node.op, ast.And):
-                parts += [self.resolve_flag(part.at(one)) for one in part.node.values]
+            parts += [self.resolve_flag(part.at(one)) for one in read_joined(part.node)]
         return parts
 
     def ends_at_success(self) -> bool:
@@ -264,3 +283,16 @@ class GoalReader:
             number = self.reward.numbers.read_constant(one.place.node)
             if one.replaces and number is not None and self._is_of_success(one) and one.weight * number < income:
                 yield one, one.weight * number, income
+
+
+def read_joined(node: ast.expr, is_either: bool = False) -> list[ast.expr]:
+    """Return what all has to be true, or of which one is enough; nothing for other expressions."""
+    bits, words = (ast.BitOr, "logical_or") if is_either else (ast.BitAnd, "logical_and")
+    match node:
+        case ast.BoolOp(op=operator, values=values) if isinstance(operator, ast.Or if is_either else ast.And):
+            return values
+        case ast.BinOp(left=left, op=operator, right=right) if isinstance(operator, bits):
+            return [left, right]
+        case ast.Call(func=ast.Attribute(attr=name), args=[left, right]) if name == words:
+            return [left, right]
+    return []

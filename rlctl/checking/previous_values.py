@@ -62,6 +62,12 @@ class KeptDifferences:
     def __init__(self, noted: NotedEpisodes) -> None:
         self.noted, self.definitions = noted, noted.definitions
         self.differences = [one for expression in noted.source.expressions for one in self._read(expression)]
+        self._flags = [
+            one
+            for whole in noted.source.expressions
+            if (sides := _read_flags(whole.node)) is not None
+            for one in self.read_pair(whole, sides)
+        ]
 
     def _read(self, whole: Expression) -> Iterator[KeptDifference]:
         if (sides := read_sides(whole.node)) is not None:
@@ -80,7 +86,7 @@ class KeptDifferences:
 
     def find_never_replaced(self) -> Iterator[KeptDifference]:
         """Yield differences whose kept value stays what reset has set, although steps subtract it."""
-        for one in self.differences:
+        for one in (*self.differences, *self._flags):
             if not is_previous_key(one.key) or self._may_be_replaced(one):
                 continue
             episodes = [one.list_values(episode[1:]) for episode in self.noted.episodes]
@@ -91,7 +97,8 @@ class KeptDifferences:
                 continue
             changes = [change for episode in episodes for change in list_changes([values[2] for values in episode])]
             moving = np.array([change for change in changes if change > 0])
-            if len(moving) < FEWEST_CHANGES or np.ptp(moving) < ZERO * moving.max():  # that is a clock
+            is_clock = one not in self._flags and moving.size and np.ptp(moving) < ZERO * moving.max()
+            if len(moving) < FEWEST_CHANGES or is_clock:
                 continue
             if not {*read_words(one.key)} & TIME_NAMES and self.is_paid(one):
                 yield one
@@ -154,6 +161,18 @@ def read_sides(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
         case ast.BinOp(left=left, op=ast.Sub(), right=right):
             return left, right
         case ast.Call(func=ast.Attribute(attr="subtract" | "change" | "difference"), args=[left, right]):
+            return left, right
+    return None
+
+
+def _read_flags(node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
+    """Return two flags of which it is asked whether both hold, or whether they are the same."""
+    match node:
+        case ast.BinOp(left=left, op=ast.BitAnd() | ast.BitXor(), right=right):
+            return left, right
+        case ast.Compare(left=left, ops=[ast.Eq() | ast.NotEq()], comparators=[right]):
+            return left, right
+        case ast.Call(func=ast.Attribute(attr="logical_and" | "logical_xor"), args=[left, right]):
             return left, right
     return None
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.checking.assignments import read_name
+from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.summands import Summand
 
@@ -19,7 +20,7 @@ def find_upright_costs(notes: NotedEpisodes) -> Iterator[tuple[Summand, ast.expr
     for summand in notes.reward.summands:
         for place in notes.definitions.walk(summand.place) if summand.weight < 0 else ():
             squared = _read_squared(place.node)
-            if squared is not None and _is_vertical_part(squared) and _is_upright(notes, squared):
+            if squared is not None and _is_vertical_part(squared) and _is_upright(notes, place.at(squared)):
                 yield summand, squared
 
 
@@ -35,25 +36,32 @@ def _read_squared(node: ast.expr) -> ast.Subscript | None:
 
 
 def _is_vertical_part(node: ast.Subscript) -> bool:
-    index = node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) and node.slice.elts else node.slice
-    match index:
-        case ast.Constant(value=2 | -1) | ast.Slice(lower=ast.Constant(value=2), upper=None, step=None):
+    """Say whether the third number of a vector is among those that an index selects."""
+    match _read_index(node):
+        case ast.Constant(value=2 | -1):
+            return True
+        case ast.Slice(lower=ast.Constant(value=1 | 2), upper=None | ast.Constant(value=3), step=None):
             return True
         case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=1)):
             return True
     return False
 
 
-def _is_upright(notes: NotedEpisodes, node: ast.Subscript) -> bool:
+def _read_index(node: ast.Subscript) -> ast.expr:
+    return node.slice.elts[-1] if isinstance(node.slice, ast.Tuple) and node.slice.elts else node.slice
+
+
+def _is_upright(notes: NotedEpisodes, place: ReadExpression) -> bool:
     """Say whether it is a part of directions in space, which begin vertical."""
-    vector, part = notes.source.find(node.value), notes.source.find(node)
-    if vector is None or part is None:
+    assert isinstance(place.node, ast.Subscript)
+    part = notes.source.find(place.node)
+    directions = notes.reward.numbers.list_arrays(place.at(place.node.value))
+    if part is None or len(directions) < FEWEST or any(np.shape(value)[-1:] != (3,) for value in directions):
         return False
-    directions = [value for call in notes.steps for value in call.values.get(vector.number, ())]
-    if len(directions) < FEWEST or any(value is None or np.shape(value)[-1:] != (3,) for value in directions):
-        return False
-    lengths = [np.linalg.norm(value, axis=-1) for value in directions if value is not None]
+    lengths = [np.linalg.norm(value, axis=-1).ravel() for value in directions]
     starts = [value for episode in notes.episodes for value in episode[1].values.get(part.number, ())[:1]]
-    begins = [float(np.min(np.abs(value))) for value in starts if value is not None]
-    is_unit = bool(np.allclose(np.concatenate([np.ravel(one) for one in lengths]), 1.0, atol=UNIT))
+    is_slice = isinstance(_read_index(place.node), ast.Slice)
+    numbers = [value[..., -1] if is_slice else value for value in starts if value is not None]  # type: ignore[index]
+    begins = [float(np.min(np.abs(value))) for value in numbers]
+    is_unit = bool(np.allclose(np.concatenate(lengths), 1.0, atol=UNIT))
     return is_unit and bool(begins) and min(begins) > UPRIGHT

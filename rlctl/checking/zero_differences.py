@@ -2,13 +2,14 @@
 
 import ast
 import dataclasses
+import functools
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
-from rlctl.checking.assignments import read_key, read_name
+from rlctl.checking.assignments import list_name_words, read_key, read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes, read_step
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.previous_values import (
@@ -53,7 +54,45 @@ class ZeroDifferences:
 
     def find_paid(self) -> Iterator[KeptDifference]:
         """Yield differences that are 0 in each step, and that the reward of the step is computed from."""
-        return (one for one in self._always if self._kept.is_paid(one))
+        copied = [one for one in self._candidates if one not in self._always and self._has_just_been_copied(one)]
+        return (one for one in (*self._always, *copied) if self._kept.is_paid(one))
+
+    def _has_just_been_copied(self, one: KeptDifference) -> bool:
+        """Say whether a step without conditions copies the new value right before it subtracts it: then the difference
+        is 0 whether or not that value has ever changed."""
+        wholes = [whole for whole, _, _ in one.list_values(self.noted.steps)]
+        if not wholes or any(whole is None or np.any(whole) for whole in wholes):
+            return False
+        function, source = one.whole.function, self.noted.source
+        body = function.body
+        places = [order for order, node in enumerate(body) if source.find_statement(one.whole.node) in ast.walk(node)]
+        for copy in self.definitions.assigned[one.key]:
+            if copy.statement in body and copy.function is function and places:
+                between = body[body.index(copy.statement) + 1 : places[0]]
+                origin = self.definitions.find_origin(copy.value, function)
+                is_same = ast.unparse(origin) == ast.unparse(one.origin) and isinstance(
+                    origin, ast.Name | ast.Attribute
+                )
+                is_before = body.index(copy.statement) < places[0]
+                changed = {key for node in between for key in self.definitions.list_sets(node)}
+                changed |= {part.id for node in between for part in ast.walk(node) if _is_set(part)}
+                if is_same and is_before and not {read_key(origin) or read_name(origin), one.key} & changed:
+                    return True
+        return False
+
+    def find_same_sides(self) -> Iterator[Expression]:
+        """Yield paid differences of an expression and itself."""
+        for one in self.noted.source.expressions:
+            match one.node:
+                case ast.BinOp(left=left, op=ast.Sub(), right=right) if ast.dump(left) == ast.dump(right):
+                    is_drawn = bool(list_name_words(left) & {"random", "rng", "noise", "normal", "uniform"})
+                    if not is_drawn and one.node in self._walked:
+                        yield one
+
+    @functools.cached_property
+    def _walked(self) -> set[ast.expr]:
+        summands, definitions = self.noted.reward.summands, self.noted.reward.definitions
+        return {place.node for summand in summands for place in definitions.walk(summand.place)}
 
     def find_observed(self) -> Iterator[KeptDifference]:
         """Yield differences that are 0 in each step, and that only the observation is computed from."""
@@ -132,6 +171,10 @@ class ZeroDifferences:
             moved = {value.number: _move(before)}
             return bool(self.noted.changes(number, step, {}, moved, read=read_step, later=LATER))
         return False
+
+
+def _is_set(node: ast.AST) -> TypeGuard[ast.Name]:
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
 
 
 def _move(value: Value) -> Any:

@@ -293,6 +293,15 @@ class RL628BoatPaddlesAtOnceInEachStep(BoatPaddles):
         return float(paid) - self.distance()
 
 
+class BoatPaddlesAtOnceTooLate(BoatPaddles):
+    def reward(self):
+        wet = self.paddles < 0.3
+        self.air = (self.air + 0.05) * ~wet
+        was_up = self.air > 0
+        paid = np.sum((self.air - 0.1) * np.logical_and(was_up, wet))
+        return float(paid) - self.distance()
+
+
 class BoatStays(Boat):
     """It has to stay at its buoy for three steps."""
 

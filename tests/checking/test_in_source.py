@@ -74,6 +74,7 @@ SHOWN = {
         "RL627BoatsWhereOldGoal": ("RL627", "BoatsWhere"),
         "RL628BoatPaddlesInEachStep": ("RL628", "BoatPaddles"),
         "RL628BoatPaddlesAtOnceInEachStep": ("RL628", "BoatPaddlesAtOnce"),
+        "BoatPaddlesAtOnceTooLate": ("RL834", "BoatPaddlesAtOnce"),
         "RL637BoatAheadFromTheStart": ("RL637", "BoatAhead"),
         "RL626BoatFromBothEnds": ("RL626", "BoatFromItsBow"),
         "RL638BoatOnCommandShowsTheFirst": ("RL638", "BoatOnCommand"),
@@ -110,6 +111,19 @@ SHOWN = {
         "RL841HopperOfTheOtherSole": ("RL841", "HopperOfItsSoles"),
         "RL841HopperOfItsShin": ("RL841", "HopperOfItsSoles"),
     },
+    "broken_success.py": {
+        "RL646BoatMoorsToOneSide": ("RL646", "BoatMoors"),
+        "BoatMoorsAnyhow": ("RL646", "BoatMoorsAtEitherEnd"),
+        "BoatMoorsWithOneOfThem": ("RL646", "BoatMoorsFully"),
+        "BoatMoorsByTheSmallerOne": ("RL646", "BoatMoorsFully"),
+        "BoatTurnsFromItself": ("RL620", "BoatTurnsSlowly"),
+        "BoatLeavesItsCourse": ("RL634", "BoatKeepsCourse"),
+        "RL647BoatForgetsItsTurns": ("RL647", "BoatTurnsSlowly"),
+        "BoatSpends": ("RL621", "BoatSpares"),
+        "BoatLimitsItsTurnsTheWrongWay": ("RL645", "BoatLimitsItsTurns"),
+        "BoatCountsNoVisits": ("RL620", "BoatCountsVisits"),
+        "BoatTurnsOnSinceTheStart": ("RL637", "BoatTurnsOn"),
+    },
     "broken_unwrapped.py": {
         "RL133BoatShowsTheLongWay": ("RL133", "BoatShowsItsError"),
         "RL618BoatPointsTheLongWay": ("RL618", "BoatPoints"),
@@ -126,6 +140,7 @@ SOUND = {
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
     "broken_starts.py": ["HopperOfFriction"],
+    "broken_success.py": ["BoatIsPaidForItsRest"],
     "broken_unwrapped.py": ["ValveHasStops"],
 }
 """What looks like one of these mistakes, and is none."""

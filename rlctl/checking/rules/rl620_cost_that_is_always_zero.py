@@ -43,9 +43,12 @@ RULE = Rule(
 @judges_expressions(RULE, decides=False)
 def _find_zero_differences(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     for one in noted.share(ZeroDifferences).find_paid():
-        message = f"{one.whole.text} is 0 in all {len(noted.steps)} steps, although {one.new.text} changes:"
+        message = f"{one.whole.text} is 0 in all {len(noted.steps)} steps, whatever {one.new.text} is:"
         message += f" {one.key} has been replaced by it before"
         yield RuleFinding(RULE, message, {"term": one.whole.text, "value": 0.0}, where=one.whole.where)
+    for same in noted.share(ZeroDifferences).find_same_sides():
+        message = f"{same.text} subtracts a value from itself"
+        yield RuleFinding(RULE, message, {"term": same.text, "value": 0.0}, where=same.where)
 
 
 @judges_records(RULE, *WITH_SEARCH, "attributes", of_absence=True)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.paid_costs import CostReader
 from rlctl.checking.records import CheckedEpisode, Records
 from rlctl.checking.rewards import (
     RAW_TERMS,
@@ -35,7 +36,8 @@ RULE = Rule(
         or a cost; costs of actions that pay more for moving than for doing nothing; a constant that is called a
         cost, or is named after time where other terms are about a goal; and, as an info, other terms that are
         called cost or penalty. In the source, a cost that squares the vertical part of a direction, which is 1 where
-        the robot stands upright.
+        the robot stands upright; the size of an action or of an error that is added, since a minus is missing or is
+        there twice; what is paid where the robot falls; and the wrong side of a limit, as in -min(0, force - limit).
     """,
     fix="Return the term without a sign, such as a distance or a squared action, and put the sign in the weight.",
 )
@@ -45,11 +47,16 @@ MOVING_PAYS = 2.0  # times as much as doing nothing
 
 
 @judges_expressions(RULE, decides=False)
-def _find_upright_costs(notes: NotedEpisodes) -> Iterator[RuleFinding]:
+def _find_paid_costs(notes: NotedEpisodes) -> Iterator[RuleFinding]:
     for summand, part in find_upright_costs(notes):
         message = f"reward term {summand.name!r} is a cost, and squares {ast.unparse(part)}, the vertical part of a"
         message += " direction: it is largest where the robot stands upright, and falls as it tilts"
         yield RuleFinding(RULE, message, {"term": summand.name}, where=notes.reward.locate(summand.place), fix=LEVEL)
+        return
+    for paid in CostReader(notes).find():
+        text = ast.unparse(paid.place.node)
+        message = f"reward term {paid.summand.name!r} counts {paid.summand.weight:+.4g} times, and {text} {paid.why}"
+        yield RuleFinding(RULE, message, {"term": paid.summand.name}, where=notes.reward.locate(paid.summand.place))
         return
 
 

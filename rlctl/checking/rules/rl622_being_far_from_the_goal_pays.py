@@ -372,7 +372,14 @@ def _read_signs(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message = f"{paid.how} in the source of the reward: {text} counts {weight:+.4g} times"
         yield RuleFinding(RULE, message, {"element": paid.summand.name}, where=notes.reward.locate(paid.place))
         return
-    for rise in RiseReader(notes).find_rises():
+    reader = RiseReader(notes)
+    for distance, summand in reader.find_paid():
+        message = f"the reward adds {ast.unparse(summand.place.node)}, which rises with the distance"
+        message += f" {distance.expression.text}"
+        where = notes.reward.locate(summand.place)
+        yield RuleFinding(RULE, message, {"element": distance.expression.text}, where=where)
+        return
+    for rise in reader.find_rises():
         (close, near), (away, far) = rise.near, rise.far
         message = (
             f"the reward rises with the distance {rise.distance.expression.text}, by {ast.unparse(rise.place.node)}:"

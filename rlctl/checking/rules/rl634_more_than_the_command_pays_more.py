@@ -21,8 +21,8 @@ RULE = Rule(
         command, and the reward rises without end as the command falls, or rises, or as it moves away from one value to
         both sides. So the policy is paid for moving as far beyond the command, or away from it, as it can. Most often
         the difference has no absolute value and no square, or the sign of the error's term is wrong. The source is
-        read, too: a difference to a command or a goal that counts with its sign, or an even power of a cosine that
-        is negative at times.
+        read, too: a difference to a command or a goal that counts with its sign, the exponential of an error without a
+        minus, or an even power of a cosine that is negative at times.
     """,
     fix="""
         Pay less for an error of either sign: np.exp(-(command - velocity)**2 / width), or -abs(command - velocity).
@@ -78,6 +78,12 @@ def _find_signed_errors(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         if values.size:
             message += f" ({text} was {values.min():.3g} to {values.max():.3g})"
         yield RuleFinding(RULE, message, {"element": name}, where=notes.reward.locate(error.place))
+        return
+    for summand, place in reader.find_growing():
+        values, text = notes.reward.numbers.list_values(place.node), ast.unparse(place.node)
+        message = f"reward term {summand.name!r} pays {text}, which grows with the size of an error and was up to"
+        message += f" {values.max():.3g}: a minus is missing"
+        yield RuleFinding(RULE, message, {"element": summand.name}, where=notes.reward.locate(place))
         return
     for summand, base in reader.find_powers():
         values, text = notes.reward.numbers.list_values(base.node), ast.unparse(base.node)

@@ -12,6 +12,7 @@ from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import MujocoTrials, WatchedWorlds, judges_trials, judges_worlds
 from rlctl.checking.feet import BASE, find_feet, list_touched, read_touches
+from rlctl.checking.first_contacts import find_counts_of_any_size, find_missed_landings
 from rlctl.checking.mujoco_worlds import MujocoStateReader, library
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_others
@@ -31,7 +32,8 @@ RULE = Rule(
         site does not contain the points of contact, which counts only forces inside its site; or numbers of the
         observation, or a reward term, that are called after the contact of feet. Or such a number is always 1, also
         while nothing touches. Or a line compares the geoms of a contact with ids of joints, or its distance with a
-        force. What is rewarded, observed or ended by contacts never changes.
+        force; or it looks for a landing after the time in the air has been set back to 0; or it asks whether the number
+        of contacts is at least 0. What is rewarded, observed or ended by contacts never changes.
     """,
     fix="""
         Make the site of a touch sensor larger than the geom that touches, and place it around the contact. Compare the
@@ -39,6 +41,8 @@ RULE = Rule(
     """,
 )
 
+LANDING = "Find out whether a foot has just come down, then set its time in the air to 0."
+COUNT = "Ask for more than 0."
 MOSTLY = 0.2  # part of the looks in which a body touches something
 AWAY = 0.1  # part of the looks in which nothing touches
 FALLEN = 0.1  # part of the looks in which its base touches something
@@ -52,8 +56,20 @@ MEANT_WORDS = {"on", "in", "flag", "flags", "force", "forces", "sensor", "sensor
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    found = itertools.chain(find_wrong_ids(RULE, noted.definitions, noted.episodes), _find_distances(noted))
+    wrong_ids = find_wrong_ids(RULE, noted.definitions, noted.episodes)
+    found = itertools.chain(wrong_ids, _find_distances(noted), _find_conditions(noted))
     yield from itertools.islice(found, 1)
+
+
+def _find_conditions(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    """Yield conditions of contacts that never hold, or always."""
+    for one in find_missed_landings(noted):
+        message = f"{one.text} never holds where a contact begins, in {one.stays} landings: {one.key}, which was up to"
+        message += f" {one.time:.3g}, has been set back to 0 before"
+        yield RuleFinding(RULE, message, {"element": one.key}, fix=LANDING, where=one.where)
+    for count in find_counts_of_any_size(noted):
+        message = f"{count.text} always holds: contacts are 0 or more, also where nothing touches"
+        yield RuleFinding(RULE, message, {"element": count.text}, fix=COUNT, where=count.where)
 
 
 def _find_distances(noted: NotedEpisodes) -> Iterator[RuleFinding]:
