@@ -5,6 +5,7 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.assignments import list_parameters, list_words
 from rlctl.checking.attitudes import compute_matrices
@@ -80,10 +81,7 @@ class Directions:
         return hits
 
     def _find_by_angles(self, turn: VectorTurn) -> tuple[int, str] | None:
-        x, y = turn.before[..., 0], turn.before[..., 1]
-        u, v = turn.after[..., 0], turn.after[..., 1]
-        angles = np.arctan2(x * v - y * u, x * u + y * v)
-        usable = np.isfinite(angles) & (np.hypot(x, y) > 1e-3)
+        angles, usable = _measure_turn(turn)
         if usable.sum() < FEWEST:
             return None
         found = []
@@ -100,8 +98,8 @@ class Directions:
                     found.append((_rank(one), sign, one.text))
         return _choose(found)
 
-    def read_yaw(self, text: str) -> Array | None:
-        """Return the angle about the vertical of an orientation that `find` has named: (calls, worlds)."""
+    def read_yaw(self, turn: VectorTurn, text: str) -> Array | None:
+        """Return the angle about the vertical of an orientation that `find` has named for a turn: (calls, worlds)."""
         for one in (one for one in self.series.orientations if one.text == text):
             if (matrices := self.series.read_matrices(one)) is not None:
                 return np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])[:, None]
@@ -110,8 +108,15 @@ class Directions:
                 order = WXYZ if "mujoco" in self._libraries else XYZW
                 yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
                 return yaw.reshape(rows.shape[:2])
-        angles = [rows for one, rows in self.angles if one.text == text]
-        return max(angles, key=lambda rows: np.isfinite(rows).sum(), default=None)  # some are read at resets only
+        angles, usable = _measure_turn(turn)
+
+        def count(rows: Array) -> tuple[int, int]:
+            """Count the calls in which an angle is that of the turn, and all: some are read at resets only."""
+            fits = rows.shape[1] in (1, angles.shape[1])
+            hits = np.abs(np.abs(np.cos(angles)) - np.abs(np.cos(rows)))[usable] < 1e-5 if fits else np.zeros(1)
+            return int(hits.sum()), int(np.isfinite(rows).sum())
+
+        return max((rows for one, rows in self.angles if one.text == text), key=count, default=None)
 
     @functools.cached_property
     def angles(self) -> list[tuple[Expression, Array]]:
@@ -162,6 +167,14 @@ class Directions:
                 if known.sum() >= FEWEST and (np.abs(np.sin(off[known])) < 1e-5).mean() > MOSTLY:
                     return True
         return False
+
+
+def _measure_turn(turn: VectorTurn) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the angles about the vertical of a turn, and where they are known."""
+    x, y = turn.before[..., 0], turn.before[..., 1]
+    u, v = turn.after[..., 0], turn.after[..., 1]
+    angles = np.arctan2(x * v - y * u, x * u + y * v)
+    return angles, np.isfinite(angles) & (np.hypot(x, y) > 1e-3)
 
 
 def _choose(found: Sequence[tuple[int, int, str]]) -> tuple[int, str] | None:

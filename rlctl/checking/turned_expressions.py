@@ -4,7 +4,7 @@ import ast
 import collections
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -26,6 +26,12 @@ class VectorTurn:
     text: str  # of the vector
     before: Array
     after: Array
+    other: Expression | None = None  # of the second element, where it is written by elements
+
+    @property
+    def wholes(self) -> Sequence[Expression]:
+        """What the elements are computed by."""
+        return [self.whole] if self.other is None else [self.whole, self.other]
 
     @property
     def turned_back(self) -> "VectorTurn":
@@ -144,5 +150,5 @@ def _read_pair(series: VectorSeries, first: _Sum, second: _Sum, parameters: set[
         if roots & parameters:  # those who call the function show which vector it is
             return None
         before, after = np.stack(vectors[:2], -1), np.stack(vectors[2:], -1)
-        return VectorTurn(first.one, None, f"({names[1]}, {names[3]})", before, after)
+        return VectorTurn(first.one, None, f"({names[1]}, {names[3]})", before, after, second.one)
     return None

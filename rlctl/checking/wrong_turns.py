@@ -4,6 +4,7 @@ import ast
 from collections.abc import Iterator
 
 from rlctl.checking.assignments import list_values, list_words
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turn_directions import Directions
 from rlctl.checking.turned_expressions import VectorTurn, find_turns
@@ -19,8 +20,9 @@ FRAME_RULES = ("RL123", "RL124", "RL125", "RL127", "RL128", "RL129")
 class TurnedVectors:
     """All turns of vectors in a source, with their directions."""
 
-    def __init__(self, series: VectorSeries) -> None:
-        self.series, self.directions, self.world = series, Directions(series), WorldVectors(series)
+    def __init__(self, series: VectorSeries, definitions: Definitions) -> None:
+        self.series, self.directions = series, Directions(series)
+        self.world = WorldVectors(series, definitions)
         self.turns = list(find_turns(series))
         self.known = [(turn, self.directions.find(turn)) for turn in self.turns]
 
