@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.assignments import CONVERSIONS, list_words, read_name
-from rlctl.checking.definitions import Definitions
+from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.source_code import Function
 from rlctl.checking.turned_expressions import VectorTurn
@@ -42,14 +42,19 @@ class ObservedCode:
     def nodes(self) -> list[ast.expr]:
         """All of them, as far as elements of the observation are their elements."""
         found: dict[ast.expr, None] = {}
+        for root in self.roots:
+            self._visit(root, found, 0)
+        return list(found)
+
+    @functools.cached_property
+    def roots(self) -> list[ast.expr]:
+        """What is returned as an observation."""
         source = self._series.source
         classes = [node for tree in source.trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
         own = sorted((one for one in classes if one.name in source.classes), key=lambda o: source.classes.index(o.name))
         methods = [one for owner in reversed(own) for one in owner.body if isinstance(one, Function)]
-        for function in {one.name: one for one in methods}.values():
-            for root in self._list_roots(function):
-                self._visit(root, found, 0)
-        return list(found)
+        functions = {one.name: one for one in methods}.values()
+        return [root for function in functions for root in self._list_roots(function)]
 
     def _list_roots(self, function: Function) -> Iterator[ast.expr]:
         for node in ast.walk(function):
@@ -66,20 +71,21 @@ class ObservedCode:
         is_difference = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)
         if node in self._turned or (is_difference and self._is_vector(node)):
             return
-        for part in self._list_parts(node):
+        for part in self.list_parts(node):
             self._visit(part, found, depth + 1)
 
     def _is_vector(self, node: ast.expr) -> bool:
         return any(self._series.read(node, size=size) is not None for size in (2, 3))
 
-    def _list_parts(self, node: ast.expr) -> list[ast.expr]:
+    def list_parts(self, node: ast.expr) -> list[ast.expr]:
+        """Return the pieces of code whose elements are elements of another one."""
         match node:
             case ast.Dict(values=values):
                 return values
             case ast.List(elts=parts) | ast.Tuple(elts=parts):
                 return parts
-            case ast.Subscript(value=owner, slice=index) if _is_vertical(index) and self._is_vector(owner):
-                return []  # the same in any direction
+            case ast.Subscript(slice=index) if _is_vertical(index):
+                return []  # of a vector the same in any direction
             case ast.Starred(value=value) | ast.UnaryOp(operand=value) | ast.Subscript(value=value):
                 return [value]
             case ast.ListComp(elt=value) | ast.GeneratorExp(elt=value) | ast.DictComp(value=value):
@@ -91,9 +97,14 @@ class ObservedCode:
             case ast.Attribute(attr="T", value=array):
                 return [array]
             case ast.Attribute():
-                return self._definitions.read(node)
+                text = ast.unparse(node)  # what is added to itself is something else than its parts
+                values = self._definitions.read(node)
+                return [one for one in values if text not in map(ast.unparse, ast.walk(one))]
             case ast.Name():
-                return [*self._definitions.read(node), *self._definitions.read_parts(node), *self._list_appended(node)]
+                several = [*self._definitions.read(node), *self._definitions.read_parts(node)]
+                function = self._series.source.find_function(node)
+                passed = self._definitions.follow(ReadExpression(node, function)) if not several else []
+                return [*several, *(one.node for one in passed), *self._list_appended(node)]
             case ast.Call(func=function, args=args, keywords=keywords):
                 name = read_name(function)
                 owner = [function.value] if isinstance(function, ast.Attribute) else []

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.assignments import list_words, peel
 from rlctl.checking.bullet_fields import BulletFields
-from rlctl.checking.definitions import Definitions
+from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.term_names import split_name
 from rlctl.checking.turned_expressions import VectorTurn
 from rlctl.checking.vector_series import FEWEST, MOSTLY, NEARLY_ALL, SAME, Array, VectorSeries
@@ -59,16 +59,20 @@ class WorldVectors:
 
     def is_engine_velocity(self, node: ast.expr | None) -> bool:
         """Say whether PyBullet, or a body of a task, returns an expression as a velocity in the axes of the world."""
-        node = None if node is None else peel(node)
+        if node is None or self.series.source.find(node) is None:
+            return False
+        place = ReadExpression(peel(node), self.series.source.find_function(node))
+        return self._is_velocity(self._definitions.resolve(place))
+
+    def _is_velocity(self, place: ReadExpression) -> bool:
+        node = peel(place.node)
         match node:
             case ast.Attribute(attr=name):
                 return name in TASK_VELOCITIES and name not in self._definitions.assigned
-            case ast.Name():
-                several = {*self._definitions.read(node), *self._definitions.read_parts(node)}
-                calls = [ast.unparse(one) for one in several if isinstance(one, ast.Call)]
-                return any("getBaseVelocity" in text for text in calls) or (
-                    len(several) == 1 and self.is_engine_velocity(several.pop())
-                )
+            case ast.Name(id=name):
+                several = self._definitions.list_assigned(place.function).get(name, ())
+                calls = [ast.unparse(one.value) for one in several if one.element is not None]
+                return bool(calls) and all("getBaseVelocity(" in text for text in calls)
             case ast.Subscript():
                 field = self._fields.find_field(node)
                 return field is not None and (field.function, field.field) in VELOCITY_FIELDS
@@ -134,13 +138,14 @@ class WorldVectors:
 
     @functools.cached_property
     def _engine_places(self) -> list[Array]:
-        found = [rows for one, rows in self.series.vectors if is_of_engine(one) or self._is_place_field(one.node)]
+        found = [rows for one, rows in self.series.vectors if is_of_engine(one) or self.is_place_field(one.node)]
         if self._has_free_joint:
             free = [rows for one, rows in self.series.vectors if re.search(FREE_PLACE, one.text.replace(" ", ""))]
             found += free
         return found
 
-    def _is_place_field(self, node: ast.expr) -> bool:
+    def is_place_field(self, node: ast.expr) -> bool:
+        """Say whether an expression is the field of a tuple of PyBullet that is a place."""
         field = self._fields.find_field(peel(node)) if isinstance(node, ast.Subscript | ast.Call | ast.Name) else None
         return field is not None and (field.function, field.field) in PLACE_FIELDS
 
