@@ -3,10 +3,13 @@
 import ast
 from collections.abc import Iterator, Sequence
 
-from rlctl.checking.assignments import read_name
+from rlctl.checking.assignments import CONVERSIONS, read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.term_names import split_name
+from rlctl.environments.simulations import find_mujoco
 
+FREE = 0  # MuJoCo's type of a joint
+OTHER_NAMES = {"vel", "velocity", "v"}  # of what is linear, if nothing else is said
 LINEAR, ANGULAR = (
     {"lin", "linear", "slip", "speed", "linvel"},
     {"ang", "angular", "omega", "gyro", "rot", "rate", "spin", "turn", "yaw", "w"},
@@ -27,6 +30,40 @@ def find_angular_parts(notes: NotedEpisodes) -> Iterator[tuple[str, str, tuple[s
         is_six = _is_filled(one.function, node.value) or read_name(node.value) == "cvel"
         if is_six and _is_first_half(node.slice) and any(call.values.get(one.number) for call in notes.steps):
             yield sorted(words & LINEAR)[0], one.text, one.where
+
+
+def find_other_halves(notes: NotedEpisodes) -> Iterator[tuple[str, str, str, tuple[str, int]]]:
+    """Yield where another half of a free joint's velocity is read than what it is called: that, the half, the
+    expression, and its place."""
+    simulation = find_mujoco(notes.instance.env)
+    if simulation is None:
+        return
+    model = simulation[0]
+    first = [int(place) for place in model.jnt_dofadr[model.jnt_type == FREE]]
+    for one in notes.source.expressions:
+        match one.node:
+            case ast.Subscript(
+                value=ast.Attribute(attr="qvel"), slice=ast.Slice(lower=lower, upper=ast.Constant(value=int(end)))
+            ):
+                begin = lower.value if isinstance(lower, ast.Constant) and isinstance(lower.value, int) else 0
+            case _:
+                continue
+        halves = [place for place in first if place <= begin and end <= place + 6]
+        words = {word for name in _list_kept(notes, one.node) for word in split_name(name)}
+        if not halves or end - begin != 3 or one.function not in notes.of_steps:
+            continue
+        what = ["linear", "mixed", "mixed", "angular"][begin - halves[0]]
+        called = "angular" if words & ANGULAR else "linear" if words & (LINEAR | OTHER_NAMES) else what
+        if called != what:
+            yield called, what, one.text, one.where
+
+
+def _list_kept(notes: NotedEpisodes, node: ast.expr) -> Sequence[str]:
+    """Return the names in which a value is kept as it is."""
+    above = notes.source.parents[node]
+    while read_name(above.func if isinstance(above, ast.Call) else above) in CONVERSIONS:  # type: ignore[arg-type]
+        above = notes.source.parents[above]
+    return [read_name(target) for target in above.targets] if isinstance(above, ast.Assign) else []
 
 
 def _list_names(

@@ -13,6 +13,8 @@ from rlctl.checking.term_names import split_name
 PLACE, TURN = {"pos", "position", "positions"}, {"orn", "orientation", "quat", "quaternion"}
 LINEAR = {"lin", "linear", "linvel", "vx", "vy", "vz"}
 ANGULAR = {"ang", "angular", "omega", "gyro", "angvel"}
+PLAIN = {"vel", "velocity", "speed", "v"}  # of a base: what is angular is called so
+TURNS = {"w", "rot", "turn", "turning", "spin", "yaw", "roll", "pitch", "rate", "rates", "wheel", "twist"}
 SPEED = {"vel", "vels", "velocity", "velocities", "speed", "speeds", "qvel", "qd", "dq", "qdot", "rate", "rates"}
 _POINT = {
     "position": ({5, 6}, PLACE),
@@ -32,7 +34,8 @@ FIELDS: Mapping[str, Mapping[str, tuple[set[int], set[str]]]] = {
     "getClosestPoints": _POINT,
     "getJointState": _JOINT,
     "getLinkState": _LINK,
-    "getBaseVelocity": {"linear velocity": ({0}, LINEAR), "angular velocity": ({1}, ANGULAR)},
+    "getBaseVelocity": {"linear velocity": ({0}, LINEAR | PLAIN), "angular velocity": ({1}, ANGULAR | TURNS)},
+    "getEulerFromQuaternion": {"roll": ({0}, {"roll"}), "pitch": ({1}, {"pitch"}), "yaw": ({2}, {"yaw", "heading"})},
     "getBasePositionAndOrientation": {"position": ({0}, PLACE), "orientation": ({1}, TURN)},
     "rayTest": {"fraction": ({2}, {"fraction"}), "position": ({3}, PLACE), "normal": ({4}, {"normal"})},
 }

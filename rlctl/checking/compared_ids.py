@@ -16,6 +16,7 @@ KINDS = {"geom": "geom", "body": "body", "joint": "joint", "jnt": "joint", "site
 LOADERS = {"loadURDF", "createMultiBody", "loadMJCF", "loadSDF"}
 POINT_KINDS = {1: {"body"}, 2: {"body"}, 3: {"link"}, 4: {"link"}}  # by fields of a contact point of PyBullet
 LOOKUPS = {"id", "name2id", "index", "find", "link", "joint", "geom", "body", "site", "sensor", "actuator"}
+CONTACT_WORDS = {"touch", "touches", "touching", "contact", "contacts"}
 FEWEST = 10
 DEEPEST = 6  # assignments that are followed
 
@@ -123,6 +124,34 @@ def find_doubled_ids(rule: Rule, source: SourceCode, evaluated: Collection[ast.A
             if doubled and len(texts) == len(node.elts):
                 message = f"{ast.unparse(node)} looks up {doubled[0]} twice: another part of the list is left out"
                 yield RuleFinding(rule, message, {"element": doubled[0]}, where=(file, node.lineno))
+        for node in (node for one in own for node in ast.walk(one)):
+            if (what := _find_repeated(node)) is not None:
+                message = f"{ast.unparse(node)} asks {what}: another part is left out"
+                yield RuleFinding(rule, message, {"element": ast.unparse(node)}, where=(file, node.lineno))  # type: ignore[attr-defined]
+
+
+def _find_repeated(node: ast.AST) -> str | None:
+    """Say which contact a list asks for twice, or for each of several parts."""
+    match node:
+        case ast.List(elts=parts) | ast.Tuple(elts=parts) if len(parts) > 1:
+            texts = [ast.unparse(part) for part in parts if _is_contact(part)]
+            doubled = [text for text, count in collections.Counter(texts).items() if count > 1]
+            if doubled and len(texts) == len(parts):
+                return f"for {doubled[0]} twice"
+        case ast.ListComp(elt=part, generators=[loop]) | ast.GeneratorExp(elt=part, generators=[loop]):
+            names = {one.id for one in ast.walk(loop.target) if isinstance(one, ast.Name)}
+            read = {one.id for one in ast.walk(part) if isinstance(one, ast.Name)}
+            is_meant = not any(name.startswith("_") for name in names) and not read & names
+            if is_meant and not loop.ifs and _is_contact(part):
+                return f"for {ast.unparse(part)} each time"
+    return None
+
+
+def _is_contact(node: ast.expr) -> bool:
+    """Say whether a call asks for the contact of a part."""
+    if not isinstance(node, ast.Call) or not node.args:
+        return False
+    return bool({*split_name(read_name(node.func))} & CONTACT_WORDS)
 
 
 def _is_lookup(node: ast.expr) -> bool:

@@ -18,7 +18,7 @@ from rlctl.checking.previous_values import is_goal
 from rlctl.checking.source_code import Expression, FaultyCode, Function, write_code
 from rlctl.checking.term_names import split_name
 from rlctl.checking.values import flatten
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 PHYSICAL_WORDS = {
     "wind", "current", "friction", "mass", "payload", "grip", "drag", "damping", "disturbance", "slope", "inertia",

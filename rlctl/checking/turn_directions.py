@@ -5,6 +5,7 @@ import functools
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rlctl.checking.assignments import list_parameters, list_words
 from rlctl.checking.attitudes import compute_matrices
@@ -19,6 +20,7 @@ ANGLE_WORDS = {"yaw", "heading", "theta", "psi", "course", "euler", "rpy", "join
 WXYZ, XYZW = [1, 2, 3, 0], [0, 1, 2, 3]
 """Where the elements x, y, z and w are."""
 MOST_CALLS = 60  # in which orientations are compared
+BETWEEN = 1.2  # part of a turn in a step by which the motion meanwhile may be apart from its middle
 LEAST_SPREAD = 0.1  # of an angle [rad], standard deviation
 
 
@@ -80,10 +82,7 @@ class Directions:
         return hits
 
     def _find_by_angles(self, turn: VectorTurn) -> tuple[int, str] | None:
-        x, y = turn.before[..., 0], turn.before[..., 1]
-        u, v = turn.after[..., 0], turn.after[..., 1]
-        angles = np.arctan2(x * v - y * u, x * u + y * v)
-        usable = np.isfinite(angles) & (np.hypot(x, y) > 1e-3)
+        angles, usable = _measure_turn(turn)
         if usable.sum() < FEWEST:
             return None
         found = []
@@ -100,8 +99,8 @@ class Directions:
                     found.append((_rank(one), sign, one.text))
         return _choose(found)
 
-    def read_yaw(self, text: str) -> Array | None:
-        """Return the angle about the vertical of an orientation that `find` has named: (calls, worlds)."""
+    def read_yaw(self, turn: VectorTurn, text: str) -> Array | None:
+        """Return the angle about the vertical of an orientation that `find` has named for a turn: (calls, worlds)."""
         for one in (one for one in self.series.orientations if one.text == text):
             if (matrices := self.series.read_matrices(one)) is not None:
                 return np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])[:, None]
@@ -110,8 +109,15 @@ class Directions:
                 order = WXYZ if "mujoco" in self._libraries else XYZW
                 yaw = np.arctan2(*compute_matrices(rows.reshape(-1, 4)[:, order])[:, [1, 0], 0].T)
                 return yaw.reshape(rows.shape[:2])
-        angles = [rows for one, rows in self.angles if one.text == text]
-        return max(angles, key=lambda rows: np.isfinite(rows).sum(), default=None)  # some are read at resets only
+        angles, usable = _measure_turn(turn)
+
+        def count(rows: Array) -> tuple[int, int]:
+            """Count the calls in which an angle is that of the turn, and all: some are read at resets only."""
+            fits = rows.shape[1] in (1, angles.shape[1])
+            hits = np.abs(np.abs(np.cos(angles)) - np.abs(np.cos(rows)))[usable] < 1e-5 if fits else np.zeros(1)
+            return int(hits.sum()), int(np.isfinite(rows).sum())
+
+        return max((rows for one, rows in self.angles if one.text == text), key=count, default=None)
 
     @functools.cached_property
     def angles(self) -> list[tuple[Expression, Array]]:
@@ -136,7 +142,8 @@ class Directions:
 
     @functools.cached_property
     def _places(self) -> list[Array]:
-        places = [rows for one, rows in self.series.vectors if is_place(one) or is_of_engine(one)]
+        vectors = self.series.vectors
+        places = [rows for one, rows in vectors if is_place(one) or is_of_engine(one) or _is_slice(one.node)]
         places += [side for way in self.series.differences for side in way.sides]
         return list({rows.tobytes(): rows for rows in places}.values())
 
@@ -144,12 +151,17 @@ class Directions:
         """Say whether the motion of the robot shows that a rotation by an angle is the one from it to the world."""
         return any(self._grows(rows) for one, rows in self.angles if one.text == text)
 
-    def _grows(self, angles: Array) -> bool:
+    def moves_by(self, node: ast.expr, text: str) -> bool:
+        """Say whether a vector moves as the place of a robot does that an angle turns."""
+        places = [rows for size in (2, 3) if (rows := self.series.read(node, size=size)) is not None]
+        return any(self._grows(rows, places) for one, rows in self.angles if one.text == text)
+
+    def _grows(self, angles: Array, places: Sequence[Array] | None = None) -> bool:
         """Say whether a place goes round the vertical as an angle grows, or moves straight ahead by it."""
         if np.nanstd(angles) < LEAST_SPREAD:
             return False
         turned = np.diff(angles, axis=0)
-        for rows in (rows for rows in self._places if rows.shape[:2] == angles.shape):
+        for rows in (rows for rows in (self._places if places is None else places) if rows.shape[:2] == angles.shape):
             x, y = np.diff(rows[..., :2], axis=0).transpose(2, 0, 1)
             round_it = np.diff(np.arctan2(rows[..., 1], rows[..., 0]), axis=0)
             ahead = np.arctan2(y, x)
@@ -157,11 +169,20 @@ class Directions:
                 ((round_it - turned) / 2, np.abs(turned) > SAME),
                 (ahead - angles[1:], np.hypot(x, y) > SAME),
                 (ahead - angles[:-1], np.hypot(x, y) > SAME),
+                (_leave_out(ahead - angles[:-1] - turned / 2, turned / 2), np.hypot(x, y) > SAME),
             ):
                 known = moving & np.isfinite(off) & (np.abs(turned) > SAME)
                 if known.sum() >= FEWEST and (np.abs(np.sin(off[known])) < 1e-5).mean() > MOSTLY:
                     return True
         return False
+
+
+def _measure_turn(turn: VectorTurn) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the angles about the vertical of a turn, and where they are known."""
+    x, y = turn.before[..., 0], turn.before[..., 1]
+    u, v = turn.after[..., 0], turn.after[..., 1]
+    angles = np.arctan2(x * v - y * u, x * u + y * v)
+    return angles, np.isfinite(angles) & (np.hypot(x, y) > 1e-3)
 
 
 def _choose(found: Sequence[tuple[int, int, str]]) -> tuple[int, str] | None:
@@ -177,6 +198,16 @@ def _rank(one: Expression) -> int:
     if names & parameters or list_words(one.node) & INVERSE_WORDS or isinstance(one.node, ast.BinOp | ast.UnaryOp):
         return 2
     return 0 if isinstance(one.node, ast.Attribute | ast.Subscript) and "self" in names else 1
+
+
+def _leave_out(off: Array, turned: Array) -> Array:
+    """Return by how much angles are off, forwards or backwards, beyond what was turned meanwhile in several steps."""
+    least = (off + np.pi / 2) % np.pi - np.pi / 2
+    return np.maximum(np.abs(least) - BETWEEN * np.abs(turned), 0.0)
+
+
+def _is_slice(node: ast.expr) -> bool:
+    return isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Slice)
 
 
 def _list_values(call: NotedCall, one: Expression) -> list[Value]:

@@ -4,7 +4,7 @@ import ast
 import collections
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -26,6 +26,13 @@ class VectorTurn:
     text: str  # of the vector
     before: Array
     after: Array
+    other: Expression | None = None  # of the second element, where it is written by elements
+    is_of_parameters: bool = False  # those who call the function show which vector it is
+
+    @property
+    def wholes(self) -> Sequence[Expression]:
+        """What the elements are computed by."""
+        return [self.whole] if self.other is None else [self.whole, self.other]
 
     @property
     def turned_back(self) -> "VectorTurn":
@@ -98,6 +105,14 @@ class _Sum:
 
 def _find_written_out(series: VectorSeries) -> Iterator[VectorTurn]:
     """Yield turns in the plane that are written by elements: c * x - s * y and s * x + c * y."""
+    for turn in list_written_out(series):
+        if not turn.is_of_parameters and _is_turn(turn.before, turn.after):
+            yield turn
+
+
+def list_written_out(series: VectorSeries) -> Iterator[VectorTurn]:
+    """Yield two sums of products of the elements of a vector and of a cosine and a sine: also those that are no turn,
+    as one sign is wrong."""
     sums = collections.defaultdict[Function, list[_Sum]](list)
     for one in series.source.expressions:
         match one.node:
@@ -109,7 +124,7 @@ def _find_written_out(series: VectorSeries) -> Iterator[VectorTurn]:
         parameters = set(list_parameters(function))
         for first, second in itertools.pairwise(found):
             turn = _read_pair(series, first, second, parameters)
-            if turn is not None and _is_turn(turn.before, turn.after):
+            if turn is not None:
                 yield turn
 
 
@@ -141,8 +156,8 @@ def _read_pair(series: VectorSeries, first: _Sum, second: _Sum, parameters: set[
         if not known.any() or np.abs(cosine[known] ** 2 + sine[known] ** 2 - 1).max() > SAME:
             continue
         roots = {node.id for part in (x, y) for node in ast.walk(part) if isinstance(node, ast.Name)}
-        if roots & parameters:  # those who call the function show which vector it is
-            return None
         before, after = np.stack(vectors[:2], -1), np.stack(vectors[2:], -1)
-        return VectorTurn(first.one, None, f"({names[1]}, {names[3]})", before, after)
+        return VectorTurn(
+            first.one, None, f"({names[1]}, {names[3]})", before, after, second.one, bool(roots & parameters)
+        )
     return None

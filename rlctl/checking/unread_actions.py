@@ -38,7 +38,7 @@ def find_unread_elements(
             for name in _list_vectors(function):
                 uses = _list_uses(source, function, name, size)
                 missing = sorted(set(range(size)) - set(uses.read))
-                twice = [element for element, nodes in uses.read.items() if _count_statements(source, nodes) > 1]
+                twice = [element for element, nodes in uses.read.items() if count_statements(source, nodes) > 1]
                 if uses.is_whole or len(missing) != 1 or len(twice) != 1:
                     continue
                 nodes = uses.read[twice[0]]
@@ -91,7 +91,7 @@ def _list_uses(source: SourceCode, function: Function, name: str, size: int) -> 
             continue
         above = source.parents[node]
         if isinstance(above, ast.Subscript) and above.value is node:
-            elements = _read_elements(above.slice, size)
+            elements = read_elements(above.slice, size)
             if elements is None or not isinstance(above.ctx, ast.Load):
                 uses.is_whole = True
             for element in elements or ():
@@ -101,19 +101,19 @@ def _list_uses(source: SourceCode, function: Function, name: str, size: int) -> 
     return uses
 
 
-def _read_elements(index: ast.expr, size: int) -> list[int] | None:
+def read_elements(index: ast.expr, size: int) -> list[int] | None:
     """Return which elements an index takes, the last axis being that of the action; None for what is not constant."""
     if isinstance(index, ast.Tuple):
         last = index.elts[-1]
         is_worlds = all(isinstance(one, ast.Slice) or _is_ellipsis(one) for one in index.elts[:-1])
-        return _read_elements(last, size) if is_worlds else None
+        return read_elements(last, size) if is_worlds else None
     match index:
         case ast.Constant(value=int(element)):
             return [element]
         case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int(element))):
             return [size - element]
         case ast.Slice(lower=lower, upper=upper, step=None):
-            ends = [None if given is None else _read_elements(given, size) for given in (lower, upper)]
+            ends = [None if given is None else read_elements(given, size) for given in (lower, upper)]
             if any(given is not None and found is None for given, found in zip((lower, upper), ends, strict=True)):
                 return None
             begin, end = ends[0][0] if ends[0] else 0, ends[1][0] if ends[1] else size
@@ -154,7 +154,7 @@ def _is_harmless(source: SourceCode, node: ast.expr, names: list[str]) -> bool:
         node = above  # type: ignore[assignment]
 
 
-def _count_statements(source: SourceCode, nodes: list[ast.Subscript]) -> int:
+def count_statements(source: SourceCode, nodes: list[ast.Subscript]) -> int:
     """Return in how many statements, or entries of a list, something is read."""
     places = set[ast.AST]()
     for node in nodes:

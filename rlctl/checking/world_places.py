@@ -16,7 +16,7 @@ JOINT_WORDS = {"joint", "joints", "leg", "legs", "finger", "fingers", "wheel", "
 FREE_PLACE = r"qpos\[0?:3\](\.copy\(\)|\.astype\([^)]*\)|\))*$"
 ENGINE_PLACE = (
     r"(\.(site_|geom_)?xi?pos(\[[^:]*\])?|getBasePositionAndOrientation\(.*\)\[0\]|getLinkState\(.*\)\[[024]\]"
-    r"|base_position|link_position\(.*\)|get_(body_com|site_xpos)\(.*\))(\.copy\(\)|\))*$"
+    r"|base_position|link_position\(.*\)|get_(body_com|site_xpos)\(.*\))(\[(:,)?0?:[23]\]|\.copy\(\)|\))*$"
 )
 """Places in the world that MuJoCo, PyBullet and tasks of rlctl return."""
 

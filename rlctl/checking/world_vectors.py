@@ -9,7 +9,9 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.assignments import list_words
+from rlctl.checking.assignments import list_words, peel
+from rlctl.checking.bullet_fields import BulletFields
+from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.term_names import split_name
 from rlctl.checking.turned_expressions import VectorTurn
 from rlctl.checking.vector_series import FEWEST, MOSTLY, NEARLY_ALL, SAME, Array, VectorSeries
@@ -23,14 +25,20 @@ DRAWN_WORDS = {"sun", "light", "star", "north", "magnetic", "field", "wind", "cu
 GRAVITY_WORDS = {"gravity", "grav", "g"}
 WATCH_WORDS = {"obs", "observe", "observation", "observations", "state", "sense", "features"}
 FREE_VELOCITY = r"qvel\[0?:3\](\.copy\(\)|\.astype\([^)]*\)|\))*$"
+VELOCITY_FIELDS = {*(("getBaseVelocity", field) for field in (0, 1)), *(("getLinkState", field) for field in (6, 7))}
+PLACE_FIELDS = {("getBasePositionAndOrientation", 0), *(("getLinkState", field) for field in (0, 4))}
+FREE_BASE = ("getBaseVelocity", ".set_base(", ".base_velocity")
+TASK_VELOCITIES = {"base_velocity", "base_angular_velocity"}
+"""Of a body of a task: both are in the axes of the world, as PyBullet's."""
 ALONG, ASIDE = 0.15, 0.4  # part of a motion that a velocity leaves over
 
 
 class WorldVectors:
     """Which vectors are those of the world, and why."""
 
-    def __init__(self, series: VectorSeries) -> None:
-        self.series = series
+    def __init__(self, series: VectorSeries, definitions: Definitions) -> None:
+        self.series, self._definitions = series, definitions
+        self._fields = BulletFields(definitions)
 
     def explain(self, turn: VectorTurn) -> str | None:
         """Return what the vector is that is turned; None where it is not known to be one of the world."""
@@ -43,9 +51,32 @@ class WorldVectors:
             return "a direction that stays the same in an episode"
         if turn.whole.function in self._watchers and (way := self.find_way(turn)) is not None:
             return f"the way {way}"
+        if self.is_engine_velocity(turn.part):
+            return "the velocity that the engine returns"
         if self.is_velocity(turn):
             return "the velocity that moves a position"
         return None
+
+    def is_engine_velocity(self, node: ast.expr | None) -> bool:
+        """Say whether PyBullet, or a body of a task, returns an expression as a velocity in the axes of the world."""
+        if node is None or self.series.source.find(node) is None:
+            return False
+        place = ReadExpression(peel(node), self.series.source.find_function(node))
+        return self._is_velocity(self._definitions.resolve(place))
+
+    def _is_velocity(self, place: ReadExpression) -> bool:
+        node = peel(place.node)
+        match node:
+            case ast.Attribute(attr=name):
+                return name in TASK_VELOCITIES and name not in self._definitions.assigned
+            case ast.Name(id=name):
+                several = self._definitions.list_assigned(place.function).get(name, ())
+                calls = [ast.unparse(one.value) for one in several if one.element is not None]
+                return bool(calls) and all("getBaseVelocity(" in text for text in calls)
+            case ast.Subscript():
+                field = self._fields.find_field(node)
+                return field is not None and (field.function, field.field) in VELOCITY_FIELDS
+        return False
 
     @functools.cached_property
     def _watchers(self) -> set[ast.AST]:
@@ -107,11 +138,16 @@ class WorldVectors:
 
     @functools.cached_property
     def _engine_places(self) -> list[Array]:
-        found = [rows for one, rows in self.series.vectors if is_of_engine(one)]
+        found = [rows for one, rows in self.series.vectors if is_of_engine(one) or self.is_place_field(one.node)]
         if self._has_free_joint:
             free = [rows for one, rows in self.series.vectors if re.search(FREE_PLACE, one.text.replace(" ", ""))]
             found += free
         return found
+
+    def is_place_field(self, node: ast.expr) -> bool:
+        """Say whether an expression is the field of a tuple of PyBullet that is a place."""
+        field = self._fields.find_field(peel(node)) if isinstance(node, ast.Subscript | ast.Call | ast.Name) else None
+        return field is not None and (field.function, field.field) in PLACE_FIELDS
 
     def _is_goal(self, places: Array) -> bool:
         """Say whether a place stays where it is in an episode, but for some steps, and is another one in others."""
@@ -125,7 +161,7 @@ class WorldVectors:
     def has_free_base(self) -> bool:
         """Whether a robot of an engine can move freely, as far as the source shows it."""
         texts = [ast.unparse(tree) for tree in self.series.source.trees.values()]
-        return self._has_free_joint or any("getBaseVelocity" in text for text in texts)
+        return self._has_free_joint or any(word in text for text in texts for word in FREE_BASE)
 
     @functools.cached_property
     def _has_free_joint(self) -> bool:

@@ -3,15 +3,19 @@
 import ast
 from collections.abc import Iterator
 
+import numpy as np
+
 from rlctl.checking.assignments import list_values, list_words
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turn_directions import Directions
-from rlctl.checking.turned_expressions import VectorTurn, find_turns
+from rlctl.checking.turned_expressions import VectorTurn, find_turns, list_written_out
 from rlctl.checking.vector_series import VectorSeries
 from rlctl.checking.world_vectors import WorldVectors
 
 WORLD_WORDS = {"world", "global", "inertial", "map"}
 WAY = "the way"
+CHANGED, FEWEST_CHANGED = 1e-3, 4  # part of its length by which no turn changes a vector; calls
 FRAME_RULES = ("RL123", "RL124", "RL125", "RL127", "RL128", "RL129")
 """The rules that find vectors in wrong frames by what is observed and paid."""
 
@@ -19,8 +23,9 @@ FRAME_RULES = ("RL123", "RL124", "RL125", "RL127", "RL128", "RL129")
 class TurnedVectors:
     """All turns of vectors in a source, with their directions."""
 
-    def __init__(self, series: VectorSeries) -> None:
-        self.series, self.directions, self.world = series, Directions(series), WorldVectors(series)
+    def __init__(self, series: VectorSeries, definitions: Definitions) -> None:
+        self.series, self.directions = series, Directions(series)
+        self.world = WorldVectors(series, definitions)
         self.turns = list(find_turns(series))
         self.known = [(turn, self.directions.find(turn)) for turn in self.turns]
 
@@ -45,9 +50,9 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
     or of all others."""
     series, directions, world = turned.series, turned.directions, turned.world
     explained = [(turn, found, world.explain(turn)) for turn, found in turned.known if found is not None]
-    starts = {_read_start(turn) for turn, found, what in explained if found[0] < 0 and (what or "").startswith(WAY)}
+    starts = {(_read_start(turn), by) for turn, (sign, by), _ in explained if sign < 0 and _read_start(turn)}
     explained = [
-        (turn, found, what or (f"{WAY} {turn.text}" if _read_start(turn) in starts - {None} else None))
+        (turn, found, what or (f"{WAY} {turn.text}" if (_read_start(turn), found[1]) in starts else None))
         for turn, found, what in explained
     ]
     rights = {found[1] for _, found, what in explained if found[0] < 0 and what is not None}
@@ -68,6 +73,23 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
             message += " and the vector is one of the world already"
             evidence = {"element": turn.whole.text, "value": turn.text}
             yield RuleFinding(rule, message, evidence, where=turn.whole.where, same=FRAME_RULES)
+
+
+def find_broken_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Iterator[RuleFinding]:
+    """Yield turns that are written by elements with one wrong sign: they turn nothing."""
+    for turn in list_written_out(turned.series):
+        known = np.isfinite(turn.before).all(axis=2) & np.isfinite(turn.after).all(axis=2)
+        before, after = (np.linalg.norm(rows[known], axis=-1) for rows in (turn.before, turn.after))
+        is_broken = (np.abs(after - before) > CHANGED * before).sum() >= FEWEST_CHANGED
+        is_way = turned.world.find_way(turn, needs_goal=False) is not None
+        if is_broken and is_way == of_ways and turn.other is not None:
+            texts = f"{turn.whole.text} and {turn.other.text}"
+            message = f"{texts} are {turn.text} turned in no direction: of their four products one has the wrong sign,"
+            message += (
+                f" and the vector changes its length by up to {np.abs(after / np.maximum(before, 1e-9) - 1).max():.0%}"
+            )
+            evidence = {"element": turn.other.text, "value": turn.text}
+            yield RuleFinding(rule, message, evidence, where=turn.other.where, same=FRAME_RULES)
 
 
 def _read_start(turn: VectorTurn) -> str | None:

@@ -161,7 +161,7 @@ class NotedEpisodes:
     @functools.cached_property
     def turned(self) -> TurnedVectors:
         """The vectors that the source turns."""
-        return TurnedVectors(VectorSeries(self.source, self.episodes))
+        return TurnedVectors(VectorSeries(self.source, self.episodes), self.definitions)
 
     @functools.cached_property
     def reward(self) -> RewardReader:

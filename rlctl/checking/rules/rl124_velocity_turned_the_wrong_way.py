@@ -79,7 +79,8 @@ def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
 @judges_expressions(RULE, decides=False)
 def _find_wrong_turns_of_lines(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     mixed = wrong_turns.find_mixed_frames(RULE, noted.turned)
-    found = itertools.chain(mixed, wrong_turns.find_wrong_turns(RULE, noted.turned, of_ways=False))
+    broken = wrong_turns.find_broken_turns(RULE, noted.turned, of_ways=False)
+    found = itertools.chain(mixed, wrong_turns.find_wrong_turns(RULE, noted.turned, of_ways=False), broken)
     yield from itertools.islice(found, 1)
 
 

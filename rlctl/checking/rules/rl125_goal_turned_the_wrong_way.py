@@ -13,11 +13,12 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.experiments.goals import judges_goals
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
 from rlctl.checking.instance import Instance
+from rlctl.checking.lone_turns import find_lone_turns, find_wrong_points
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
-from rlctl.checking.wrong_turns import find_wrong_turns
+from rlctl.checking.wrong_turns import find_broken_turns, find_wrong_turns
 from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
@@ -50,7 +51,14 @@ class _Frame(NamedTuple):
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    yield from itertools.islice(find_wrong_turns(RULE, noted.turned, of_ways=True), 1)
+    turned = noted.turned
+    found = itertools.chain(
+        find_wrong_turns(RULE, turned, of_ways=True),
+        find_wrong_points(RULE, turned),
+        find_broken_turns(RULE, turned, of_ways=True),
+        () if any(find_wrong_turns(RULE, turned, of_ways=False)) else find_lone_turns(RULE, turned, noted.definitions),
+    )
+    yield from itertools.islice(found, 1)
 
 
 @judges_goals(RULE)

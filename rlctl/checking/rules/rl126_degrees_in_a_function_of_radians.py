@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from rlctl.checking.angle_mistakes import AngleMistakes, find_first
+from rlctl.checking.assignments import peel
 from rlctl.checking.experiments.attributes import find_declared_numbers
 from rlctl.checking.experiments.build import judges_built
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -59,6 +60,7 @@ def _list_calls(
     """Yield the calls of functions of angles with a constant of more than a turn, and its name if it has one; without
     those of other classes."""
     parts = [part for part in tree.body if not isinstance(part, ast.ClassDef) or part.name in classes]
+    declared = {**declared, **_read_lists(tree)}
     for node in itertools.chain(*map(ast.walk, parts)):
         if isinstance(node, ast.Call):
             for angle in _list_angles(node):
@@ -66,6 +68,21 @@ def _list_calls(
                 if found is not None and abs(found[1]) > TURN and 2 * found[1] == round(2 * found[1]):
                     yield node, *found
                     break
+
+
+def _read_lists(tree: ast.Module) -> Mapping[str, float]:
+    """Return the largest of the numbers of each list or array that a module names in capitals."""
+    found: dict[str, float] = {}
+    for statement in tree.body:
+        match statement:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value) if name.isupper():
+                parts = peel(value)
+                numbers = parts.elts if isinstance(parts, ast.List | ast.Tuple) else []
+                constants = [one.value for one in numbers if isinstance(one, ast.Constant)]
+                values = [float(one) for one in constants if isinstance(one, int | float)]
+                if values and len(values) == len(numbers):
+                    found[name] = max(values)
+    return found
 
 
 def _list_angles(call: ast.Call) -> Sequence[ast.expr]:

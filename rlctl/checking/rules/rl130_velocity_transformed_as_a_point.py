@@ -1,5 +1,6 @@
 """RL130: velocity transformed as a point."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -9,12 +10,14 @@ from rlctl.checking.body_frames import turn_plane
 from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.experiments.attributes import find_log_without_engine
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.points_and_velocities import LoggedPlace, LoggedVelocity, list_places_of
 from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import list_attribute_turns, name_elements, name_observed, name_part
+from rlctl.checking.transformed_velocities import TransformedVelocities
 from rlctl.checking.worlds import CENTRE, FRAME, LINEAR, TURN, TURNING, Array
 
 RULE = Rule(
@@ -23,8 +26,9 @@ RULE = Rule(
     Severity.WARNING,
     meaning="""
         Two or three elements of the observation are a velocity from which a position was subtracted: v - p, or
-        R.T @ (v - p) in the frame of a body. A function that transforms points was called with a velocity. What stands
-        still has a velocity then, and the further from the origin of the world, the larger.
+        R.T @ (v - p) in the frame of a body. A function that transforms points was called with a velocity, or a
+        line of the source subtracts one from the other. What stands still has a velocity then, and the further from the
+        origin of the world, the larger.
     """,
     fix="A velocity is only rotated, R.T @ v; the origin of a frame is subtracted from points.",
 )
@@ -35,6 +39,11 @@ CLEARLY = 10.0  # how many times more is left without the position, or without t
 LEAST_FACTOR = 1e-3
 MOST_POINTS = 12
 MOST_ELEMENTS = 100
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(TransformedVelocities(noted).find(RULE), 1)
 
 
 @judges_worlds(RULE)

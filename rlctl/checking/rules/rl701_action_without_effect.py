@@ -16,6 +16,7 @@ from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import OutOfTime, Rule, RuleFinding, Severity, list_names
 from rlctl.checking.term_weights import list_methods
 from rlctl.checking.unread_actions import find_unread_elements
+from rlctl.checking.unread_followers import find_unread_followers
 from rlctl.checking.values import find_author
 
 RULE = Rule(
@@ -53,7 +54,9 @@ in the observation; or nothing."""
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     shape = getattr(noted.instance.env.action_space, "shape", None)
     size = int(np.prod(shape or 0))
-    yield from itertools.islice(find_unread_elements(RULE, noted.source, noted.of_steps, size), 1)
+    found = find_unread_elements(RULE, noted.source, noted.of_steps, size)
+    followers = find_unread_followers(RULE, noted.definitions, noted.turned.series, noted.of_steps, size)
+    yield from itertools.islice(itertools.chain(found, followers), 1)
 
 
 @judges_actions(RULE)

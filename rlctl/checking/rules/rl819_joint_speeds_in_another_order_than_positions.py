@@ -1,9 +1,12 @@
 """RL819: joint speeds in another order than positions."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 
+from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
 from rlctl.checking.joint_copies import JointCopy
+from rlctl.checking.paired_states import PairedStates
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
 RULE = Rule(
@@ -13,7 +16,8 @@ RULE = Rule(
     meaning="""
         Consecutive elements of the observation are exactly the positions of some joints, and others are exactly
         the speeds of the same joints in another order. A policy can learn from that, but a controller of the
-        real robot that fills both in one order, or a term that multiplies them, mixes up the joints.
+        real robot that fills both in one order, or a term that multiplies them, mixes up the joints. Or a line of the
+        source computes a force from the position of one joint of MuJoCo and from the speed of another one.
     """,
     fix="""
         Use one list of indices for both. In MuJoCo, model.jnt_qposadr and model.jnt_dofadr give the places of a
@@ -22,6 +26,11 @@ RULE = Rule(
 )
 
 FEWEST_JOINTS = 2  # in a block whose order is compared
+
+
+@judges_expressions(RULE, decides=False)
+def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
+    yield from itertools.islice(PairedStates(noted).find(RULE), 1)
 
 
 @judges_worlds(RULE)
