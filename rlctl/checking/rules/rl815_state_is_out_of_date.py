@@ -47,7 +47,8 @@ RULE = Rule(
         mj_forward, they are of the episode before, or 0 after mj_resetData. A robot without an engine - the length
         of a vector follows where an attribute was before the step, and not where it is. With any engine or none -
         a line of the source reads a part of the state before the step moves the robot, and the observation has it
-        afterwards, next to parts that are read later.
+        afterwards, next to parts that are read later; or only reset computes a value that is seen from the robot, such
+        as the way to the goal.
     """,
     fix="""
         Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
