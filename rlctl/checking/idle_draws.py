@@ -25,6 +25,7 @@ PHYSICAL_WORDS = {
     "stiffness", "tide", "flow", "mu", "viscosity", "density", "buoyancy", "ballast", "traction",
 }  # fmt: skip
 """What decides how a robot moves."""
+KEPT_WORDS = PHYSICAL_WORDS | {"bias", "backlash", "deadband"}
 MEASURED_WORDS = {"bias", "noise", "sensor", "measured", "estimated", "std"}
 STEPS, EPISODES = 30, 2  # that are played with other draws
 FEWEST = 10  # steps of an episode that ends
@@ -97,13 +98,14 @@ class IdleDraws:
         for function in self._functions:
             for text, several in self.definitions.list_assigned(function).items():
                 one = several[0]
-                if not any(is_draw(node) for node in ast.walk(one.value)) or one.is_part:
+                if one.is_part or not self._draws(one.statement, function):
                     continue
-                name = read_key(one.target) or text
                 if isinstance(one.target, ast.Name):
-                    is_unread = self._is_name_unread(function, text)
+                    is_drawn_here = any(is_draw(node) for node in ast.walk(one.value))
+                    is_unread = is_drawn_here and self._is_name_unread(function, text)
                 else:
-                    is_unread = self._is_physical({name}) and not self._is_attribute_read(name)
+                    key = read_key(one.target)
+                    is_unread = bool(read_words(key) & KEPT_WORDS) and not self._is_attribute_read(key)
                 if is_unread:
                     what = f"{write_code(one.statement)}: it is drawn, and nothing reads it"
                     yield FaultyCode(one.statement, what, self.source.find_place(one.statement))

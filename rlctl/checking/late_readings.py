@@ -133,7 +133,8 @@ class LateReadings:
 
     @functools.cached_property
     def _driven(self) -> set[str]:
-        """The keys of the attributes that steps compute from the action, or from others that they do."""
+        """The keys of the attributes that steps compute from the action, or from others that they do, or read from the
+        engine."""
         assigned = [
             (key, {name for top, _ in sources for name in list_name_words(top)}, reads)
             for key, several in self.definitions.assigned.items()
@@ -143,6 +144,12 @@ class LateReadings:
             for reads in [self._list_reads(one)]
         ]
         driven = {key for key, words, _ in assigned if words & DONE_WORDS}
+        driven |= {
+            key
+            for key, several in self.definitions.assigned.items()
+            for one in several
+            if one.function in self.noted.of_steps and one.element is None and self._reads_engine(one)
+        }
         for call, _ in self.definitions.calls["append"] + self.definitions.calls["put"]:  # to a queue
             if isinstance(call.func, ast.Attribute) and any(list_name_words(arg) & DONE_WORDS for arg in call.args):
                 driven.add(read_key(call.func.value))
@@ -162,7 +169,8 @@ class LateReadings:
     def _list_pairs(self, value: Expression, one: Assignment) -> list[_Pair]:
         """Return steps in which the value is computed once, before the robot is moved, and other than in the next
         one."""
-        moves = self._list_own_moves(one) or self._moves
+        own = self._list_own_moves(one)
+        moves, is_copied = own or self._moves, bool(own) and not self._reads_engine(one)
         found: list[_Pair] = []
         for episode in self.noted.episodes:
             for call, following in itertools.pairwise(episode[1:]):
@@ -172,7 +180,7 @@ class LateReadings:
                 if len(old) != 1 or len(new) != 1 or old[0] is None or new[0] is None:
                     continue
                 by_engine = max((place for place, number in enumerate(numbers) if number in self._moves), default=moved)
-                if numbers.index(value.number) > min(moved, by_engine):
+                if numbers.index(value.number) > (moved if is_copied else min(moved, by_engine)):
                     return []
                 if not _is_same(old[0], new[0]):
                     found.append(_Pair(call.events[moved + 1 :], old[0], new[0]))

@@ -1,5 +1,7 @@
 """A skiff whose reset or whose clock decides less than it seems, next to its twins."""
 
+from collections import deque
+
 import numpy as np
 from robots import Robot
 
@@ -126,3 +128,29 @@ class SkiffOnOneCourse(Skiff):
             self.course = self.draw_course()
         self.gates = self.place + self.course
         self.look()
+
+
+class SkiffByItsFixes(Skiff):
+    """It goes by the newest of several fixes."""
+
+    def start(self):
+        self.fixes = deque(maxlen=8)
+        super().start()
+        self.fixes.extend([self.place] * 8)
+        self.look()
+
+    def advance(self, action):
+        super().advance(action)
+        self.fixes.append(self.place.copy())
+
+    def look(self):
+        c, s = np.cos(self.heading), np.sin(self.heading)
+        place = self.fixes[-1] if self.fixes else self.place
+        self.way = np.array([[c, s], [-s, c]]) @ (self.gates[self.gate] - place)
+
+
+class SkiffByItsOldestFix(SkiffByItsFixes):
+    def look(self):
+        c, s = np.cos(self.heading), np.sin(self.heading)
+        if self.fixes:
+            self.way = np.array([[c, s], [-s, c]]) @ (self.gates[self.gate] - self.fixes[0])

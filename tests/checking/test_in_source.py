@@ -51,6 +51,7 @@ SHOWN = {
         "RL817SkiffGetsHeavier": ("RL817", "Skiff"),
         "SkiffOfOneSeed": ("RL306", "Skiff"),
         "SkiffOnOneCourse": ("RL306", "Skiff"),
+        "SkiffByItsOldestFix": ("RL815", "SkiffByItsFixes"),
     },
     "broken_kernels.py": {
         "CartNearByTurning": ("RL643", "Cart"),

@@ -24,7 +24,7 @@ RULE = Rule(
         All seeds give the same start and, with the same actions, the same trajectory: a policy may memorise it.
         Some tasks are fixed (a puzzle, a maze), so this is only an info. A fixed start with random steps is no
         finding. It is a warning where reset draws a goal that is then replaced or never read, or that only the first
-        reset draws, and where each reset makes a generator from one number.
+        reset draws, and where each reset makes a generator from one number, or gives one to super().reset.
     """,
     fix="""
         If the task should vary, draw the start from self.np_random in reset, after super().reset(seed=seed).

@@ -23,6 +23,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.late_readings import LateReadings
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
+from rlctl.checking.old_entries import OldEntries
 from rlctl.checking.old_ways import find_old_ways
 from rlctl.checking.readings import FEWEST_LOOKS, MOST_ELEMENTS, NEARLY_ALL, name_features, read_features
 from rlctl.checking.records import FIRST_SEED, Records
@@ -47,7 +48,8 @@ RULE = Rule(
         mj_forward, they are of the episode before, or 0 after mj_resetData. A robot without an engine - the length
         of a vector follows where an attribute was before the step, and not where it is. With any engine or none -
         a line of the source reads a part of the state before the step moves the robot, and the observation has it
-        afterwards, next to parts that are read later.
+        afterwards, next to parts that are read later; or only reset computes a value that is seen from the robot, such
+        as the way to the goal; or that way is taken from the oldest entry of a history.
     """,
     fix="""
         Read after the last step; call getLinkState(..., computeForwardKinematics=True), and
@@ -63,6 +65,7 @@ FORWARD = (
 )
 READ_MUJOCO = "Read after the last mj_step; then call mujoco.mj_forward(model, data) for what follows from positions."
 READ_BULLET = "Read after the last stepSimulation; call getLinkState(..., computeForwardKinematics=True)."
+READ_NEWEST = "Read the newest entry: of a deque with appended entries that is [-1]."
 READ_LINES = "Read it after the last step of the physics, or after the robot's own equations."
 READ_ATTRIBUTES = "Compute what is observed after the robot has moved."
 FORWARD_AT_RESET = "Call mujoco.mj_forward(model, data) in reset, after qpos and qvel are written."
@@ -123,6 +126,14 @@ def _judge_lines(noted: NotedEpisodes) -> Iterator[RuleFinding]:
         place = noted.source.find_place(start.assignment.statement)
         evidence = {"element": start.read.text, "call": "reset"}
         yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_LINES, where=place)
+        return
+    for old in OldEntries(noted).find():
+        message = (
+            f"{old.read.text} is the oldest entry of {old.key}, and {old.way.text} (line {old.way.node.lineno}) is a"
+        )
+        message += " way to a goal from there: not from where the robot is"
+        evidence = {"element": old.read.text}
+        yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=READ_NEWEST, where=old.read.where)
         return
 
 

@@ -18,7 +18,8 @@ RULE = Rule(
         moved: the check saw how the clock goes on in short episodes, and where the time limit is. Or a reset draws a
         number that nothing reads, or that decides how a robot moves, such as a wind or a mass, and with other draws the
         same actions earn the same to the last bit: it is not written to the engine, or to another body, or the
-        equations do not have it. The policy is trained without it. Events of a task are judged by RL014.
+        equations do not have it. Or reset sets the world back after it has placed the robot, or a line only computes
+        something. The policy is trained without it. Events of a task are judged by RL014.
     """,
     fix="""
         Count in the same units, steps or seconds, and let what comes come within max_steps; apply what is drawn in the
