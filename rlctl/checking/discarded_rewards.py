@@ -39,7 +39,8 @@ def _compare(
             continue
         first, last = block.index(before.statement), block.index(after.statement)
         reads = [node for one in block[first + 1 : last + 1] for node in ast.walk(one) if _reads(node, name)]
-        is_counted = notes.reward.numbers.read_constant(before.value) is None
+        # What is unpacked among others, as from super().step(action), need not be used.
+        is_counted = before.element is None and notes.reward.numbers.read_constant(before.value) is None
         if first < last and not reads and is_counted:
             yield DiscardedReward(before, after)
 

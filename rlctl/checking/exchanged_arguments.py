@@ -62,10 +62,10 @@ class CallReader:
         """Return what a call gives to parameters whose names are known."""
         if any(isinstance(argument, ast.Starred) for argument in call.args):
             return {}
-        if read_name(call.func) == "clip" and isinstance(call.func, ast.Attribute):
-            is_method = read_root(call.func.value) not in LIBRARIES
-            return bind(call, [*CLIPPED[is_method:]])
         own = self.definitions.find_function(read_name(call.func))
+        if own is None and read_name(call.func) == "clip" and isinstance(call.func, ast.Attribute):
+            is_function = read_root(call.func.value) in LIBRARIES or len(call.args) >= len(CLIPPED)
+            return bind(call, CLIPPED if is_function else CLIPPED[1:])
         return bind(call, list_parameters(own) if own is not None else self._list_foreign(call.func))
 
     def _list_foreign(self, node: ast.expr) -> list[str]:

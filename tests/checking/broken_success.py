@@ -163,3 +163,35 @@ class BoatKeepsCourse(BoatShowsItsError):
 class BoatLeavesItsCourse(BoatKeepsCourse):
     def reward(self):
         return 0.2 * np.exp((-self.error()) ** 2) - self.distance()
+
+
+class BoatFetchesItsCrate(Boat):
+    """It goes to a crate, which it then takes to a goal."""
+
+    def start(self):
+        super().start()
+        self.goal = self.buoy
+        self.crate = self.place + self.np_random.uniform(-0.3, 0.3, 2)
+
+    def size(self):
+        return 8
+
+    def observe(self):
+        return np.array([*super().observe(), *(self.goal - self.crate)], np.float32)
+
+    def move(self, action):
+        before = self.place
+        super().move(action)
+        if np.linalg.norm(self.crate - self.place) < 0.1:
+            self.crate = self.crate + self.place - before
+
+    def is_success(self):
+        return np.linalg.norm(self.goal - self.crate) < 0.2
+
+    def reward(self):
+        return -np.linalg.norm(self.crate - self.place) - np.linalg.norm(self.goal - self.crate)
+
+
+class BoatLeavesItsCrate(BoatFetchesItsCrate):
+    def is_success(self):
+        return np.linalg.norm(self.goal - self.place) < 0.2

@@ -117,6 +117,7 @@ SHOWN = {
         "BoatMoorsAnyhow": ("RL646", "BoatMoorsAtEitherEnd"),
         "BoatMoorsWithOneOfThem": ("RL646", "BoatMoorsFully"),
         "BoatMoorsByTheSmallerOne": ("RL646", "BoatMoorsFully"),
+        "BoatLeavesItsCrate": ("RL626", "BoatFetchesItsCrate"),
         "BoatTurnsFromItself": ("RL620", "BoatTurnsSlowly"),
         "BoatLeavesItsCourse": ("RL634", "BoatKeepsCourse"),
         "RL647BoatForgetsItsTurns": ("RL647", "BoatTurnsSlowly"),

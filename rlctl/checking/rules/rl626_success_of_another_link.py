@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from rlctl.checking.drawn_goals import Numbers, Source
+from rlctl.checking.exchanged_objects import ObjectReader
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.goals import NEAR, judges_goals
 from rlctl.checking.goal_episodes import PLACED_STEPS, GoalEpisode, GoalTrials
@@ -25,7 +26,8 @@ RULE = Rule(
         object: its way to the goal is observed, or it is the achieved_goal, and success is where the hand is; or
         what is observed as its way is not 0 where it is at the goal, as with the goal in the world and the object
         in the robot's frame. Or the source compares the goal with two places that are always the same way apart: one
-        of them is in another frame, or another point of the same body.
+        of them is in another frame, or another point of the same body; or it compares the goal with the hand, pays the
+        hand for reaching an object, and computes the way of this object to the goal elsewhere.
     """,
     fix="Use the same link, and the same point of it, in the observation, in the reward and for success.",
 )
@@ -41,6 +43,11 @@ def _find_places_apart(noted: NotedEpisodes) -> Iterator[RuleFinding]:
         message = f"{one.whole.text} and {other.whole.text} (line {other.whole.where[1]}) compare {one.goal} with two"
         message += f" places that are always {apart} apart, although both move"
         yield RuleFinding(RULE, message, {"element": one.name, "value": apart}, where=one.whole.where)
+    for found in ObjectReader(noted).find():
+        message = f"success compares {found.goal} with {found.hand}: the reward pays the way from {found.hand} to"
+        message += f" {found.thing}, and the source also computes that of {found.thing} to {found.goal}"
+        yield RuleFinding(RULE, message, {"element": found.hand}, where=noted.reward.locate(found.place))
+        return
 
 
 @judges_goals(RULE)
