@@ -90,8 +90,10 @@ class ObservedCode:
                 return [value]
             case ast.ListComp(elt=value) | ast.GeneratorExp(elt=value) | ast.DictComp(value=value):
                 return [value]
-            case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult() | ast.Div(), right=right):
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
                 return [left, right]
+            case ast.BinOp(left=left, op=ast.Mult() | ast.Div(), right=right):
+                return [one for one, other in ((left, right), (right, left)) if not self._varies(other)]
             case ast.IfExp(body=body, orelse=other):
                 return [body, other]
             case ast.Attribute(attr="T", value=array):
@@ -113,6 +115,13 @@ class ObservedCode:
                     return [*owner, *given]
                 return [*self._definitions.read_returned(node), *(one for one in given if self._is_like(node, one))]
         return []
+
+    def _varies(self, node: ast.expr) -> bool:
+        """Say whether a factor is another one in other calls, or nothing."""
+        several = [self._series.read(node, size=size) for size in (None, 2, 3)]
+        known = [rows[np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))] for rows in several if rows is not None]
+        moves = (float(np.ptp(rows, axis=0).max(initial=0.0)) > SAME or not rows.any() for rows in known if len(rows))
+        return any(moves)
 
     def _list_appended(self, name: ast.Name) -> list[ast.expr]:
         """Return what is appended to a list."""
