@@ -140,7 +140,8 @@ class HopperWatchesItself(MujocoHopper):
     """It observes the parts of its velocity by their names."""
 
     def spin(self):
-        return self.data.qvel[3:6].copy()
+        gyro = self.data.qvel[3:6].copy()
+        return 0.25 * gyro
 
     def observe(self):
         return np.concatenate([super().observe(), self.spin()])
@@ -148,7 +149,8 @@ class HopperWatchesItself(MujocoHopper):
 
 class RL640HopperWatchesAnotherPart(HopperWatchesItself):
     def spin(self):
-        return self.data.qvel[2:5].copy()
+        gyro = self.data.qvel[2:5].copy()
+        return 0.25 * gyro
 
 
 class RL819HopperBrakesItsBase(MujocoHopper):
