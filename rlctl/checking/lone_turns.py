@@ -23,7 +23,7 @@ def find_wrong_points(rule: Rule, turned: TurnedVectors) -> Iterator[RuleFinding
         if found is None or found[0] > 0 or not _is_constant(turn) or not _is_added_to_place(turned, turn, found[1]):
             continue
         by = found[1]
-        if (turn.before.shape[2] == 3 and by in rights) or turned.directions.counts_forwards(by):
+        if (turn.before.shape[2] == 3 and by in rights) or by in turned.rights or turned.directions.counts_forwards(by):
             message = f"{turn.whole.text} turns {turn.text}, which is fixed to a body, by the inverse of {by}, from the"
             message += " world to the body, and it is added to a place in the world"
             evidence = {"element": turn.whole.text, "value": turn.text}

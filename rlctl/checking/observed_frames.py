@@ -14,7 +14,7 @@ from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.source_code import Function
 from rlctl.checking.turned_expressions import VectorTurn
-from rlctl.checking.vector_series import VectorSeries
+from rlctl.checking.vector_series import FEWEST, VectorSeries
 from rlctl.checking.wrong_turns import FRAME_RULES, TurnedVectors
 
 Array = NDArray[np.float64]
@@ -90,8 +90,10 @@ class ObservedCode:
                 return [value]
             case ast.ListComp(elt=value) | ast.GeneratorExp(elt=value) | ast.DictComp(value=value):
                 return [value]
-            case ast.BinOp(left=left, op=ast.Add() | ast.Sub() | ast.Mult() | ast.Div(), right=right):
+            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
                 return [left, right]
+            case ast.BinOp(left=left, op=ast.Mult() | ast.Div(), right=right):
+                return [one for one, other in ((left, right), (right, left)) if not self._varies(other)]
             case ast.IfExp(body=body, orelse=other):
                 return [body, other]
             case ast.Attribute(attr="T", value=array):
@@ -111,8 +113,15 @@ class ObservedCode:
                 given = [*args, *(keyword.value for keyword in keywords)]
                 if name in PASSED_ON:
                     return [*owner, *given]
-                return [*self._definitions.read_returned(node), *(one for one in given if self._is_like(node, one))]
+                return self._definitions.read_returned(node) or [one for one in given if self._is_like(node, one)]
         return []
+
+    def _varies(self, node: ast.expr) -> bool:
+        """Say whether a factor is another one in other calls, or nothing."""
+        several = [self._series.read(node, size=size) for size in (None, 2, 3)]
+        known = [rows[np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))] for rows in several if rows is not None]
+        moves = (float(np.ptp(rows, axis=0).max(initial=0.0)) > SAME or not rows.any() for rows in known if len(rows))
+        return any(moves)
 
     def _list_appended(self, name: ast.Name) -> list[ast.expr]:
         """Return what is appended to a list."""
@@ -187,7 +196,13 @@ def _moves(rows: Array) -> bool:
 def _is_same_vector(series: VectorSeries, node: ast.expr, turn: VectorTurn) -> bool:
     """Say whether a piece of code is worth what is turned, and not what it is turned into."""
     rows = series.read(node, size=turn.before.shape[2])
-    return rows is not None and _is_same(rows, turn.before) and not _is_same(rows, turn.after)
+    if rows is None or rows.shape != turn.before.shape:
+        return False
+    known = np.isfinite(rows).all(axis=2) & np.isfinite(turn.before).all(axis=2)
+    before, after = (
+        np.allclose(rows[known], other[known], rtol=SAME, atol=1e-9) for other in (turn.before, turn.after)
+    )
+    return bool(known.sum() >= FEWEST and before and not after)
 
 
 def _begins_anywhere(series: VectorSeries, yaw: Array) -> bool:

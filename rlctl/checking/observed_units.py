@@ -30,13 +30,20 @@ class ObservedUnits:
         if node in self._seen or depth > DEEPEST:
             return
         self._seen.add(node)
+        is_own = isinstance(node, ast.Call) and read_name(node.func) in self._definitions.functions
+        parts = self._observed.list_parts(node)
+        if parts and (is_own or isinstance(node, ast.Name | ast.Attribute)):
+            found = [entry for part in parts for entry in self._list(part, depth + 1)]  # as it is computed
+            if found:
+                yield from found
+                return
         angle = self._readings.find(node, self._source.find_function(node))
         if angle is not None and angle.unit in (Unit.DEGREES, Unit.RADIANS):
             yield node, angle
         elif ast.unparse(peel(node)) in self._taken:
             yield node, Angle(Unit.RADIANS, "by what is computed with it")
         else:
-            for part in self._observed.list_parts(node):
+            for part in parts:
                 yield from self._list(part, depth + 1)
 
     @functools.cached_property

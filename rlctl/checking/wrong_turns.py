@@ -1,6 +1,7 @@
 """Where the source turns a vector of the world by an orientation itself, instead of its inverse."""
 
 import ast
+import functools
 from collections.abc import Iterator
 
 import numpy as np
@@ -29,6 +30,12 @@ class TurnedVectors:
         self.turns = list(find_turns(series))
         self.known = [(turn, self.directions.find(turn)) for turn in self.turns]
 
+    @functools.cached_property
+    def rights(self) -> set[str]:
+        """The orientations by whose inverse a vector that is known to be one of the world is turned."""
+        backwards = [(turn, found[1]) for turn, found in self.known if found is not None and found[0] < 0]
+        return {by for turn, by in backwards if self.world.explain(turn) is not None}
+
 
 def find_mixed_frames(rule: Rule, turned: TurnedVectors) -> Iterator[RuleFinding]:
     """Yield the axes of the body, turned by the inverse, that are multiplied with a vector of the world."""
@@ -55,8 +62,9 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
         (turn, found, what or (f"{WAY} {turn.text}" if (_read_start(turn), found[1]) in starts else None))
         for turn, found, what in explained
     ]
-    rights = {found[1] for _, found, what in explained if found[0] < 0 and what is not None}
-    rights |= {found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)}
+    rights = turned.rights | {
+        found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)
+    }
     seen, rights_3d = set[int](), {one.text for one in series.orientations}
     for turn, (sign, by), what in explained:
         if sign < 0 or what is None or turn.whole.number in seen:

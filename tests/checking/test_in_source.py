@@ -53,6 +53,17 @@ SHOWN = {
         "SkiffOnOneCourse": ("RL306", "Skiff"),
         "SkiffByItsOldestFix": ("RL815", "SkiffByItsFixes"),
     },
+    "broken_frames.py": {
+        "RL129BargeFeelsTheWindOfTheWorld": ("RL129", "Barge"),
+        "RL125BargeHasItsBowBehind": ("RL125", "Barge"),
+        "RL125BargeForgetsASign": ("RL125", "Barge"),
+        "RL125BargeTurnsOneTheOtherWay": ("RL125", "Barge"),
+        "RL130BargeMovesItsSpeed": ("RL130", "Barge"),
+        "RL134BargeTurnsInDegrees": ("RL134", "Barge"),
+        "RL701BargePushesTwice": ("RL701", "Barge"),
+        "RL640HopperWatchesAnotherPart": ("RL640", "HopperWatchesItself"),
+        "RL819HopperBrakesItsBase": ("RL819", "HopperWatchesItself"),
+    },
     "broken_kernels.py": {
         "CartNearByTurning": ("RL643", "Cart"),
         "RL643CartAlignedByDistance": ("RL643", "CartOfTerms"),
@@ -138,6 +149,7 @@ SOUND = {
     "broken_early.py": ["RaftSettles", "RaftLevels", "PuckGlides"],
     "broken_exchanged.py": ["BoatLooksBack"],
     "broken_fields.py": ["RamApart", "RamOtherNames"],
+    "broken_frames.py": ["BargeTurnsInPartsOfATurn"],
     "broken_late.py": ["CrabSteersByIt", "CrabKeepsAView", "CrabKeepsTime", "SnailRemembers", "SnailGains"],
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
@@ -148,7 +160,14 @@ SOUND = {
 """What looks like one of these mistakes, and is none."""
 SEVERAL = {"broken_ahead.py", "broken_early.py", "broken_kernels.py", "broken_starts.py"}
 """Files whose mistakes have consequences that the source shows, too."""
-MUJOCO = {"broken_early.py", "broken_late.py", "broken_refreshed.py", "broken_seen.py", "broken_starts.py"}
+MUJOCO = {
+    "broken_early.py",
+    "broken_frames.py",
+    "broken_late.py",
+    "broken_refreshed.py",
+    "broken_seen.py",
+    "broken_starts.py",
+}
 BULLET = {"broken_early.py", "broken_fields.py", "broken_late.py", "broken_seen.py"}
 ERRORS = {"RL116"}
 

@@ -1,4 +1,4 @@
-"""RL124, RL125, RL129, RL701, RL834, RL835, RL840: vectors that are turned, elements read, ids compared, by lines."""
+"""RL124, RL125, RL129, RL701, RL834, RL835, RL840, RL843: vectors turned, elements read, ids compared, by lines."""
 
 import pytest
 
@@ -39,11 +39,12 @@ CASES += [
     case(f"broken_ids.py:{name}", (name[:5], "warning"), twin="broken_ids.py:Biped", slow=True) for name in COMPARED
 ]
 CASES += [case("broken_ids.py:RL840BipedDrivesLeftTwice", ("RL840", "warning"), twin="broken_ids.py:Biped")]
+CASES += [case("broken_frames.py:RL843HopperSinks", ("RL843", "warning"), twin="broken_frames.py:HopperWatchesItself")]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
-    if case.broken.startswith("broken_ids"):
+    if case.broken.startswith(("broken_ids", "broken_frames")):
         pytest.importorskip("mujoco")
     check_case(case)
 

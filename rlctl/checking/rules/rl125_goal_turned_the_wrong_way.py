@@ -28,8 +28,9 @@ RULE = Rule(
     meaning="""
         The observation has the way to a goal, turned by the orientation of a body, or by its yaw, in the wrong
         direction: it is neither in the world's frame nor in that of the body. The check moved the goal to see how it
-        is turned, or a line of the source turns the way by the orientation itself. A policy that does not see the
-        heading too cannot learn where the goal is.
+        is turned, or a line of the source turns the way by the orientation itself, turns a point of the body by the
+        inverse before it adds it to its place, has one wrong sign, or turns one vector of the observation the other way
+        than all others. A policy that does not see the heading too cannot learn where the goal is.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v); by a yaw

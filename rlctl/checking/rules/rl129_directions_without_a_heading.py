@@ -23,10 +23,10 @@ RULE = Rule(
         angles, or, of a robot on a vertical hinge, the hinge and what is free. What is observed in the frame of the
         robot stays the same then. Some elements turn, so they are in the axes of the world, and nothing of the
         observation shows the heading: a policy cannot know in which direction of the robot they point. Or all of the
-        observation stays the same, and the reward is another one. Or elements turn twice as far: they are turned in
-        the wrong direction. Or the source puts a vector of the world into the observation next to one that it turns
-        into the frame of the robot. An info where all episodes begin with nearly the same heading: then the policy
-        only loses its way as it turns.
+        observation stays the same, and the reward is another one. Or elements turn twice as far: they are turned in the
+        wrong direction. Or the source puts a vector of the world into the observation next to one that it turns into
+        the frame of the robot, or one that it turns into it elsewhere. An info where all episodes begin with nearly the
+        same heading: then the policy only loses its way as it turns.
     """,
     fix="""
         Turn the vectors into the frame of the robot, x' = cos(yaw) x + sin(yaw) y and y' = cos(yaw) y - sin(yaw) x, or

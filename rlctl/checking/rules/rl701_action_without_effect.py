@@ -27,9 +27,10 @@ RULE = Rule(
         An element of the action was set to its lowest and to its highest value, and the episode stayed the same to the
         last bit. Noise on such an element only costs exploration. An element that only changes the reward of its own
         step (a cost) or its own copy in the observation moves nothing either. Or the source reads one element in two
-        statements and never the one beside it. An error if no element does anything else: there is nothing to learn. An
-        info if the reward of the own step can also rise, as in a bandit, if the source compares the element, as that of
-        a gripper, or if all values in one half of the range do the same; a warning where that is so for every element.
+        statements and never the one beside it, also of an attribute that follows the action. An error if no element
+        does anything else: there is nothing to learn. An info if the reward of the own step can also rise, as in a
+        bandit, if the source compares the element, as that of a gripper, or if all values in one half of the range do
+        the same; a warning where that is so for every element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a

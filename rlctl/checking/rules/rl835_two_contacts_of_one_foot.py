@@ -22,8 +22,8 @@ RULE = Rule(
     meaning="""
         Two neighbouring elements of the observation say whether feet, fingers or wheels touch something. Both always
         say the same, and follow one link, while another link touches at other times, and no element follows it. Or a
-        list of the source looks up one name twice. One of the two was looked up by the name or the number of the
-        other. Rewards that use these contacts are wrong for that link as well.
+        list of the source looks up one name twice, or asks for one contact twice. One of the two was looked up by the
+        name or the number of the other. Rewards that use these contacts are wrong for that link as well.
     """,
     fix="Look each link or geom up by its own name; check that the list of them has no entry twice.",
 )
