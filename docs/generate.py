@@ -12,7 +12,7 @@ from typing import Any
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
 from rlctl.recipe.recipe import ALGORITHMS, SCHEMA_FILE, build_schema
-from rlctl.recipe.sources import list_presets
+from rlctl.recipe.recipe_files import list_presets
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Schema
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from rlctl.checking.check import check
 from rlctl.checking.rule import Rule
-from rlctl.checking.rules import FAMILIES, RULES
+from rlctl.checking.rule_index import FAMILIES, RULES
 from rlctl.environments.spec import EnvSpec
 
 ROOT = Path(__file__).parent.parent

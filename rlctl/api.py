@@ -48,7 +48,7 @@ def make(
 
 def _make_spec(task: str, parameters: Mapping[str, Any], sim: str | None) -> EnvSpec:
     from rlctl.engine import read_engine
-    from rlctl.recipe.sources import make_spec
+    from rlctl.recipe.recipe_files import make_spec
 
     spec = make_spec(task, parameters)
     return spec if sim is None else dataclasses.replace(spec, sim=read_engine(sim))
@@ -78,7 +78,7 @@ def check_env(
     rules were not judged for lack of time.
     """
     from rlctl.checking.check import check
-    from rlctl.checking.rules import choose_rules
+    from rlctl.checking.rule_index import choose_rules
     from rlctl.checking.tool_formats import read_baseline
     from rlctl.errors import AnswerIsNo, RlctlError, TaskError
 

@@ -28,7 +28,7 @@ from rlctl.processes import child_process
 from tests.forked_process import SIGNALS, become
 
 ROOT = Path(__file__).parents[1]
-FOR_WORKERS = ("rlctl.play.worker", "rlctl.task.env", "rlctl.environments.info", "rlctl.checking.children")
+FOR_WORKERS = ("rlctl.play.worker", "rlctl.task.env", "rlctl.environments.info", "rlctl.checking.child")
 FOR_COMMANDS = (
     *("torch.utils.tensorboard", "stable_baselines3", "sb3_contrib", "rlctl.cli", "rich.console"),
     *("rlctl.evaluation.evaluate", "rlctl.evaluation.report", "rlctl.policy.torch_policy", "rlctl.tasks.listing"),

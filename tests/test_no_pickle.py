@@ -102,5 +102,5 @@ def test_one_module_reads_pickles_and_four_use_it():
             users.setdefault(module, set()).add(str(file.relative_to(ROOT / "rlctl")))
     for library in ("pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve"):
         assert users.get(library, set()) <= {"processes/messages.py"}, library
-    expected = {"checking/children.py", "processes/child_process.py", "processes/pool.py", "launching/child.py"}
+    expected = {"checking/child.py", "processes/child_process.py", "processes/pool.py", "launching/child.py"}
     assert users["rlctl.processes.messages"] == expected

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from rlctl.checking.assignments import CONVERSIONS, read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.term_names import split_name
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 FREE = 0  # MuJoCo's type of a joint
 OTHER_NAMES = {"vel", "velocity", "v"}  # of what is linear, if nothing else is said

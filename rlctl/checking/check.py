@@ -13,7 +13,7 @@ from rlctl.checking.children import Supervisor
 from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from rlctl.checking.records import Records
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding, Severity
-from rlctl.checking.rules import (
+from rlctl.checking.rule_index import (
     DECIDED_BY,
     JUDGES,
     MOST_GROWTH,
@@ -27,7 +27,6 @@ from rlctl.environments import registry
 from rlctl.environments.leaves import name_leaf
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import UsageError, did_you_mean
-from rlctl.recipe import sources
 
 METHODS = {"RL1": "step", "RL3": "reset", "RL4": "__init__", "RL5": "step", "RL6": "step", "RL7": "step"}
 """The method that the findings of a family are about, where nothing more is known."""
@@ -218,6 +217,8 @@ def check(
 def _normalizes(task: str, what: str) -> bool:
     if registry.find_recipe_file(task) is None:
         return False
+    from rlctl.recipe import sources  # slow
+
     normalize = sources.resolve(task, None, {}).normalize
     return normalize is not None and bool(getattr(normalize, what))
 

@@ -1,4 +1,4 @@
-"""The child processes of a check: what runs in one, and how the parent starts and watches them, two at a time.
+"""The child processes of a check: how the parent starts and watches them, two at a time.
 
 If one dies or hangs, that is a failure, and its other experiments run in a new process, to judge most rules even then.
 """
@@ -6,136 +6,21 @@ If one dies or hangs, that is a failure, and its other experiments run in a new 
 import dataclasses
 import functools
 import os
-import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from gymnasium import spaces
-
-from rlctl.checking.experiment import HASH_SEEDS, Experiment
-from rlctl.checking.instance import Budget, Context, EnvironmentRaised, describe_failure, raised_by_environment
-from rlctl.checking.progress import CallProgress, Position, read_clock, read_clock_of
-from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished, Mistake, Skipped
-from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
-from rlctl.checking.rules import EXPERIMENTS
+from rlctl.checking.experiment import HASH_SEEDS
+from rlctl.checking.progress import CallProgress, Position, read_clock_of
+from rlctl.checking.records import Built, CallFailure, ChildMessage, End, Finished
+from rlctl.checking.rule_index import find_modules
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import UsageError
 from rlctl.printed_lines import LineReader, clean
 from rlctl.processes.child_process import ChildEndedError, ChildProcess, Standstill, anonymous_file
-from rlctl.processes.messages import send
-
-
-def main(
-    connection: Connection,
-    process: str,
-    spec: EnvSpec,
-    experiments: list[str],
-    seconds: float,
-    most_growth: float,
-    memory: int,
-) -> None:
-    """Run some experiments of one process and send what they yield. `memory`: the descriptor of the progress."""
-    send_all(connection, run(process, spec, experiments, seconds, CallProgress(memory), most_growth))
-
-
-def send_all(connection: Connection, messages: Iterator[ChildMessage]) -> None:
-    """Send what a child process yields, and that this was all."""
-    for message in messages:
-        send(connection, message)
-    send(connection, End())
-
-
-def run(
-    process: str,
-    spec: EnvSpec,
-    experiments: Sequence[str],
-    seconds: float,
-    progress: CallProgress | None = None,
-    most_growth: float = 1.0,
-    known: Mapping[str, Experiment] = EXPERIMENTS,
-) -> Iterator[ChildMessage]:
-    """Yield the messages of some experiments of one process, which may take so many seconds together.
-
-    A slow environment may take up to `most_growth` times as long. `known` has the experiments by name.
-    """
-    context = Context(spec, progress)
-    context.seconds, context.most_growth = seconds, most_growth
-    try:
-        for message in _run_all(context, [known[name] for name in experiments], seconds):
-            yield dataclasses.replace(message, process=process) if isinstance(message, CallFailure) else message
-    except UsageError as error:
-        yield Mistake(str(error))
-
-
-def _run_all(context: Context, chosen: Sequence[Experiment], seconds: float) -> Iterator[ChildMessage]:
-    began = read_clock()
-    shares = sum(experiment.share for experiment in chosen)
-    for experiment in chosen:
-        started, growth = read_clock(), context.growth
-        end = began + seconds * growth
-        if experiment.name == "build":
-            yield from _run(experiment, context)
-            if not context.is_built:
-                return
-            began += read_clock() - started  # importing and building comes on top
-        elif context.is_built and not isinstance(context.instance.env.action_space, spaces.Space):
-            yield Skipped(experiment.name, "its action space is not a space of Gymnasium")
-        elif started > end:
-            spent = f"earlier experiments used all of the {seconds * growth:.3g} s of computing time"
-            yield Skipped(experiment.name, spent)
-            yield Finished(experiment.name, 0.0, is_complete=False, is_cut=True, needed_s=context.needed_s)
-        else:
-            own_end = started + (end - started) * experiment.share / shares
-            further = functools.partial(_grow_further, context, growth)
-            context.budget = Budget(own_end, last=end, began=started, growth=further)
-            yield from _run(experiment, context)
-        shares -= experiment.share
-    if context.is_built:
-        context.progress.phase("close")
-        yield from context.instance.close()
-
-
-def _grow_further(context: Context, known: float) -> float:
-    """Return how much the time of an experiment has grown beyond what was known at its beginning."""
-    return context.growth / known
-
-
-def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
-    started = time.monotonic()
-    context.progress.phase(experiment.name)
-    is_complete, crash = True, ""
-    with_finding: set[str] = set()
-    try:
-        for message in experiment.run(context):
-            if isinstance(message, RuleFinding):
-                with_finding.add(message.rule)
-            yield message
-    except (NotJudged, NotApplicable, RecursionError) as reason:  # of the environment's calls it is `EnvironmentRaised`
-        why = TOO_DEEP if isinstance(reason, RecursionError) else str(reason)
-        for name in (*experiment.rules, experiment.name):
-            if name not in with_finding:
-                yield Skipped(name, why, applies=not isinstance(reason, NotApplicable))
-    except EnvironmentRaised as error:
-        is_complete = False
-        yield describe_failure(error, context.progress)
-    except UsageError:
-        raise
-    except Exception as error:  # what calls of the environment raise was caught at the call
-        is_complete = False
-        if raised_by_environment(error):
-            yield describe_failure(EnvironmentRaised("reading an attribute", error), context.progress)
-        else:
-            crash = traceback.format_exc()
-    seconds, is_cut = time.monotonic() - started, context.budget.was_cut
-    yield Finished(experiment.name, seconds, is_complete, is_cut, crash, needed_s=context.needed_s)
-
 
 BUILD_TIMEOUT_S = 60.0  # How long importing and building may take, unless a step may take longer
 FIRST_CALLS = 3.0  # So many times longer than others the first reset or step may take: it may compile or load
-TOO_DEEP = "an expression of its source is nested too deeply to be read"
 IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 
 
@@ -143,7 +28,7 @@ IDLE_TIMEOUT_S = 300.0  # outside of the environment: loading libraries [s]
 class ChildMain:
     """The function that runs in the child processes; it takes the arguments of `main`, and `options`."""
 
-    function: str = "rlctl.checking.children:main"
+    function: str = "rlctl.checking.child:main"
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -168,7 +53,8 @@ class Child:
         self._memory = anonymous_file()
         self.progress = CallProgress(self._memory)
         self._readers = LineReader(functools.partial(self._keep, counts=True)), LineReader(self._keep)
-        arguments = {"process": name, "spec": spec, "experiments": self.experiments}
+        modules = find_modules(experiments)
+        arguments = {"process": name, "spec": spec, "experiments": self.experiments, "modules": modules}
         self.process = ChildProcess(
             main.function,
             {**arguments, "seconds": seconds, "most_growth": most_growth, "memory": self._memory, **main.options},

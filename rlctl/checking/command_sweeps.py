@@ -18,7 +18,7 @@ from rlctl.checking.mujoco_worlds import FREE
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.snapshots import Beginnings, Snapshot
 from rlctl.environments.bullet_clients import ClientCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 Array = NDArray[np.float64]
 MOMENTS = [(seed, steps) for steps in (5, 9) for seed in range(FIRST_SEED, FIRST_SEED + 4)]

@@ -14,7 +14,7 @@ from rlctl.checking.values import find_numbers, flatten, list_parts
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array, Link
 from rlctl.environments.bullet_calls import Contacts
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 SEEDS = (FIRST_SEED + 1, FIRST_SEED + 2)
 STEPS, FEWEST_STEPS = 15, 4  # of an episode; those in which the environment was shown contacts

@@ -19,7 +19,7 @@ from rlctl.checking.mujoco_worlds import copy_data, library, refresh
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.values import flatten
 from rlctl.checking.worlds import Array
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 DERIVED = {
     "xpos": "body", "xquat": "body", "xmat": "body", "xipos": "body", "ximat": "body", "subtree_com": "body",

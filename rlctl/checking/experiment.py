@@ -6,6 +6,7 @@ How a rule uses them is in the package `rules`; experiments that several rules s
 from __future__ import annotations
 
 import dataclasses
+import importlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Generic, TypeVar
 
@@ -16,6 +17,7 @@ from rlctl.checking.rule import Rule, RuleFinding
 RunExperiment = Callable[[Context], Iterator[ChildMessage]]
 JudgeRecords = Callable[[Records], Iterable[RuleFinding]]
 Shown = TypeVar("Shown")
+Value = TypeVar("Value")
 
 RECORDING = ("comparisons", "episodes", "instances")
 """The experiments that record episodes for all rules: with random and other actions, alone and beside another."""
@@ -93,6 +95,22 @@ def experiment(
         return Experiment(name, process, place, share, run, tuple(rule.id for rule in rules), hooks)
 
     return make
+
+
+def import_experiments(modules: Iterable[str]) -> dict[str, Experiment]:
+    """Return the experiments that some modules define, by name; raises `ValueError` for two of one name."""
+    members = (vars(importlib.import_module(module)).values() for module in modules)
+    found = (value for values in members for value in list(values) if isinstance(value, Experiment))
+    return index((one.name, one) for one in found)
+
+
+def index(pairs: Iterable[tuple[str, Value]]) -> dict[str, Value]:
+    """Return a dictionary; raises `ValueError` for what would be in it twice."""
+    found: dict[str, Value] = {}
+    for name, value in pairs:
+        if found.setdefault(name, value) is not value:
+            raise ValueError(f"{name}: two of {type(value).__name__}; one is enough")
+    return found
 
 
 def judges_records(rule: Rule, *needs: str, of_absence: bool = False) -> Callable[[JudgeRecords], RecordsJudge]:

@@ -17,16 +17,16 @@ from rlctl.checking.check import CheckReport
 from rlctl.checking.junit import to_junit
 from rlctl.checking.records import Records
 from rlctl.checking.rule import RuleFinding, Severity
-from rlctl.checking.rules import FAMILIES, RULES, find_rule
+from rlctl.checking.rule_index import FAMILIES, RULES, find_rule
 from rlctl.checking.speed import format_speed
 from rlctl.checking.tool_formats import Row, action_rows, observation_rows, to_annotations, to_json, to_sarif
 from rlctl.checking.working_copy import is_own
 from rlctl.environments import registry
-from rlctl.environments.info import describe_randomization
 from rlctl.environments.places import format_place
 from rlctl.errors import UsageError
-from rlctl.recipe import sources
+from rlctl.recipe.recipe_files import read
 from rlctl.storage import files
+from rlctl.task.events.event import describe_randomization
 
 STYLES = {Severity.ERROR: "bold red", Severity.WARNING: "yellow", Severity.INFO: "cyan"}
 SHOWN_LINES = 3  # of what a dying process printed
@@ -197,10 +197,9 @@ def _list_names(records: Records) -> set[str]:
 
 def _randomizes(task: str) -> bool:
     """Return whether the recipe that comes with a task lets events act."""
-    if registry.find_recipe_file(task) is None:
-        return False
-    recipe = sources.resolve(task, None, {})
-    return recipe.randomize or bool(recipe.events)
+    file = registry.find_recipe_file(task)
+    packaged = read(file) if file else {}
+    return bool(packaged.get("randomize") or packaged.get("events"))
 
 
 def _list_rules(names: list[str]) -> str:

@@ -10,7 +10,7 @@ from rlctl.checking.bullet_worlds import read_world
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import FREE, HINGE, SLIDE
 from rlctl.environments.bullet_clients import ClientCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 from rlctl.task.rotations import from_axis, multiply, rotate
 
 UP, UPRIGHT = (0.0, 0.0, 1.0), 1 - 1e-6

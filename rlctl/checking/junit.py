@@ -4,7 +4,7 @@ from collections import defaultdict
 
 from rlctl.checking.check import CheckReport
 from rlctl.checking.rule import RuleFinding, Severity
-from rlctl.checking.rules import FAMILIES, RULES
+from rlctl.checking.rule_index import FAMILIES, RULES
 from rlctl.storage import junit
 from rlctl.storage.junit import Case, CaseEntry, Suite
 

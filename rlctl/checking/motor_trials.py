@@ -13,7 +13,7 @@ from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.mujoco_worlds import library, read_commands
 from rlctl.checking.rule import list_names
 from rlctl.checking.worlds import Array, Joint, JointActuator
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 
 @dataclasses.dataclass

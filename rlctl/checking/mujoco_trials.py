@@ -14,7 +14,7 @@ from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import list_names
 from rlctl.checking.values import flatten
 from rlctl.checking.worlds import Array
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 STEPS = 25
 

@@ -32,7 +32,7 @@ from rlctl.checking.worlds import (
     World,
     WorldBody,
 )
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 FREE, BALL, SLIDE, HINGE = range(4)  # MuJoCo's types of joints
 PLANES = (0, 1)  # Types of geoms without a thickness: planes and height fields

@@ -12,7 +12,7 @@ from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.source_code import write_code
 from rlctl.checking.term_names import split_name
 from rlctl.checking.worlds import WorldBody
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 LEFT, RIGHT, FRONT, REAR = "left", "right", "front", "rear"
 SIDES = {

@@ -11,7 +11,7 @@ from rlctl.checking.assignments import peel
 from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.rule import Rule, RuleFinding
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 
 class PairedStates:

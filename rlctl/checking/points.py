@@ -11,7 +11,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.values import read_attributes
 from rlctl.checking.worlds import FRAME, World
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 MOST_NUMBERS = 12  # of an attribute: a place, or a state that begins with one
 Numbers = NDArray[np.float64]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rlctl.checking.check import CheckReport
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rule import RuleFinding, Severity
-from rlctl.checking.rules import FAMILIES, RULES
+from rlctl.checking.rule_index import FAMILIES, RULES
 from rlctl.checking.speed import Speed
 from rlctl.environments.leaves import Leaf, name_leaf
 from rlctl.errors import ArtifactError

@@ -14,7 +14,7 @@ from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import NotApplicable
 from rlctl.checking.worlds import WorldBody
 from rlctl.environments.bullet_clients import ClientCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 from rlctl.task.env import TaskEnv
 from rlctl.task.mujoco.sim import MujocoSim
 

@@ -34,7 +34,7 @@ from rlctl.checking.worlds import (
 )
 from rlctl.environments.bullet_calls import BulletCalls
 from rlctl.environments.bullet_clients import find_clients
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 DEEPEST_FINE = 0.02  # [m]; Bullet pushes links apart over several steps, heavy robots leave up to 2 cm
 LEAST_LIMIT = 0.005  # The same for the smallest things [m]: collision margins alone are 1 to 4 mm

@@ -94,10 +94,10 @@ def check_env(
     from rlctl import output as streams
     from rlctl.checking import formats
     from rlctl.checking.check import check
-    from rlctl.checking.rules import choose_rules
+    from rlctl.checking.rule_index import choose_rules
     from rlctl.checking.tool_formats import read_baseline
     from rlctl.environments.suggestions import find_only_class
-    from rlctl.recipe.sources import make_spec
+    from rlctl.recipe.recipe_files import make_spec
 
     if explain is not None and explain.upper().startswith("Q"):
         from rlctl.runs.diagnosis import findings

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +12,8 @@ import pydantic
 from gymnasium import spaces
 
 from rlctl.environments.dict_spaces import LARGEST_SPACE, SINGLE, format_space, split_space
-from rlctl.environments.driven_joints import describe_driven_joints, joint_name
+from rlctl.environments.driven_joints import describe_driven_joints
+from rlctl.environments.simulations import find_mujoco
 from rlctl.errors import ArtifactError, OldGymError, TaskError, UsageError, short_repr
 from rlctl.storage import validation
 from rlctl.task.commands import CommandTerm
@@ -35,8 +34,6 @@ from rlctl.task.terms import (
 )
 
 if TYPE_CHECKING:
-    import mujoco
-
     from rlctl.environments.gym_worlds import GymWorlds
     from rlctl.environments.wrappers import TimeFeature
     from rlctl.task.worlds import TaskWorlds
@@ -45,7 +42,6 @@ AnyTerm = Annotated[
     Scaled | Gravity | Euler | Displacement | Distance | LastAction | PhaseClock | Playback | ClipOrientation,
     pydantic.Field(discriminator="kind"),
 ]
-_SHOWN_JOINTS = 8
 _ONE_HOT = 10  # each value of a discrete space counts as this many elements of a Box
 
 
@@ -191,33 +187,6 @@ def _find_command_ranges(commands: Mapping[str, CommandTerm]) -> dict[str, tuple
     return {name: ends for name, ends in ranges.items() if math.isfinite(sum(ends)) and ends[0] < ends[1]}
 
 
-def find_mujoco(env: gymnasium.Env[Any, Any]) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """Return the MuJoCo model and data of an environment, or None.
-
-    They are its `model` and `data`, else the first that fit each other among its attributes, or among theirs.
-    """
-    library, inner = sys.modules.get("mujoco"), getattr(env, "unwrapped", env)
-    if library is None:
-        return None
-    sim = getattr(inner, "sim", None)
-    world = sim if "MujocoSim" in {cls.__name__ for cls in type(sim).__mro__} else inner
-    model, data = (getattr(world, name, None) for name in ("model", "data"))
-    if isinstance(model, library.MjModel) and isinstance(data, library.MjData):
-        return model, data
-    for holder in (world, *_list_attributes(world)):
-        values = _list_attributes(holder)
-        models = (value for value in values if isinstance(value, library.MjModel))
-        states = [value for value in values if isinstance(value, library.MjData)]
-        for model, data in itertools.product(models, states):
-            if data.qpos.size == model.nq and len(data.xpos) == model.nbody:
-                return model, data
-    return None
-
-
-def _list_attributes(holder: object) -> list[Any]:
-    return list(getattr(holder, "__dict__", {}).values())
-
-
 def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     """Return `control_dt` [s] and `joints` of an environment that MuJoCo simulates; empty for any other."""
     simulation = find_mujoco(env)
@@ -226,27 +195,6 @@ def describe_model(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     dt = getattr(env.unwrapped, "dt", None)  # not from the frame rate, which is rounded: 67 for a step of 0.015 s
     step = {"control_dt": float(dt)} if isinstance(dt, float | int) and dt > 0 else {}
     return {**step, "joints": describe_driven_joints(env, simulation[0])}
-
-
-def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
-    """Return the mass of a model in MuJoCo, and its joints with their limits; empty for any other environment."""
-    simulation = find_mujoco(env)
-    if simulation is None:
-        return ""
-    model, joints = simulation[0], []
-    for joint in np.flatnonzero(model.jnt_type >= int(sys.modules["mujoco"].mjtJoint.mjJNT_SLIDE)):
-        low, high = model.jnt_range[joint]
-        limits = f" {low:.3g} to {high:.3g}" if model.jnt_limited[joint] else ""
-        joints.append(f"{joint_name(model, int(joint))}{limits}")
-    more = f" and {len(joints) - _SHOWN_JOINTS} more" if len(joints) > _SHOWN_JOINTS else ""
-    return f"{model.body_mass.sum():.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
-
-
-def describe_randomization(events: Mapping[str, bool]) -> str:
-    """Return `randomised by NAMES` or `not randomised`; empty for an environment without events."""
-    if acting := [name for name, acts in events.items() if acts]:
-        return f"randomised by {', '.join(acting)}"
-    return "not randomised" if events else ""
 
 
 _PORT = "write `import gymnasium as gym`; reset returns (observation, info), and step five values"

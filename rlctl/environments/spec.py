@@ -17,7 +17,6 @@ from rlctl.environments.graphics import refuse_windows
 from rlctl.environments.registry import call_plugin, is_task, load, may_make_environments
 from rlctl.errors import RecipeError, TaskError, check_name, short_repr
 from rlctl.library_output import print_mujoco_warnings
-from rlctl.storage import validation
 
 if TYPE_CHECKING:
     import gymnasium
@@ -347,6 +346,8 @@ def check_fields(task: Any, values: Mapping[str, Any]) -> dict[str, Any]:
     import typing
 
     import pydantic
+
+    from rlctl.storage import validation
 
     fields = task.parameters()
     hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if values else {}

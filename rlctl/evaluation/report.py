@@ -8,7 +8,6 @@ from pydantic_core import to_jsonable_python
 from rich.text import Text
 
 from rlctl import output
-from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.episode_statistics import Spread
 from rlctl.evaluation.eval_request import NO_GATES, Gates, judge
 from rlctl.evaluation.evaluate import Evaluation
@@ -17,6 +16,7 @@ from rlctl.evaluation.robustness import Cell, FailedCell, Outcome, PushTest, Rob
 from rlctl.evaluation.sequential import EarlyGate
 from rlctl.evaluation.vary import format_command
 from rlctl.policy.shipped import Interval, MeasuredScore
+from rlctl.task.events.event import describe_randomization
 from rlctl.version import collect_versions
 
 _MOST_COLUMNS = 25  # of a map that is drawn

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rlctl.checking import junit as check_junit
 from rlctl.checking.check import CheckReport, check
-from rlctl.checking.rules import choose_rules
+from rlctl.checking.rule_index import choose_rules
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation import junit as evaluation_junit

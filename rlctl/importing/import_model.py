@@ -17,7 +17,7 @@ from rlctl.errors import ArtifactError, UsageError
 from rlctl.importing.sb3_model import SavedModel, read_model, read_normalization
 from rlctl.policy.file import PolicyFile, PolicyInfo
 from rlctl.policy.load import load_policy
-from rlctl.recipe.sources import make_spec
+from rlctl.recipe.recipe_files import make_spec
 from rlctl.storage import files
 from rlctl.version import collect_versions
 

@@ -59,7 +59,7 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
         """Return the spec of the environment it was trained in, or of another task, with `changes`."""
         if task is not None and task != self.spec.task:
-            from rlctl.recipe.sources import make_spec  # few commands play another task
+            from rlctl.recipe.recipe_files import make_spec  # few commands play another task
 
             return changes.apply(make_spec(task).observe_as(self.spec))
         own = self.spec.replace_missing_engine()

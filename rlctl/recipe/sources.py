@@ -9,10 +9,11 @@ from typing import Any
 
 from rlctl.engine import Engine
 from rlctl.environments import registry
-from rlctl.environments.spec import EnvChanges, EnvSpec, check_given, merge
-from rlctl.errors import ArtifactError, RecipeError, check_name, did_you_mean, short_repr
+from rlctl.environments.spec import EnvChanges, check_given, merge
+from rlctl.errors import RecipeError, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import WITH_PRIVILEGED, NormalizeSettings, Recipe, Source, validate
+from rlctl.recipe.recipe_files import find_config, read
 from rlctl.storage import yaml_text
 
 _DEEPEST_KEY = 20
@@ -126,18 +127,6 @@ def resolve_with_stages(task: str, config: Path | None = None, settings: Mapping
     return recipe
 
 
-def make_spec(task: str, parameters: Mapping[str, Any] | None = None) -> EnvSpec:
-    """Return the environment of a task that the user named: of its recipe only the engine counts.
-
-    Raises `RecipeError` if the recipe names no engine that exists.
-    """
-    file = registry.find_recipe_file(task)
-    packaged = read(file) if file else {}
-    named = {"sim": packaged["sim"]} if "sim" in packaged else {}
-    recipe = validate(named, Source(str(file), named, file))
-    return EnvSpec(task, parameters or {}, sim=recipe.sim or Engine())
-
-
 def fill_defaults(recipe: Recipe) -> Recipe:
     """Fill in defaults that depend on other keys: rollout length, normalisation, evaluation interval."""
     kwargs, on_policy = dict(recipe.algo_kwargs), recipe.algo in ON_POLICY
@@ -169,33 +158,6 @@ def describe_rounding(recipe: Recipe) -> str | None:
         f"training takes {steps:,} steps, not {recipe.total_timesteps:,}: {recipe.algo} needs whole rollouts of "
         f"{rollout:,} steps (n_steps x n_envs)"
     )
-
-
-def read(path: Path) -> dict[str, Any]:
-    """Read a recipe file as plain data, unchecked."""
-    if not path.exists():
-        raise ArtifactError(f"no recipe file {path}; presets: {', '.join(list_presets())}")
-    content = yaml_text.load(yaml_text.read_text(path), str(path))
-    if content is not None and not isinstance(content, dict):
-        raise RecipeError(f"{path}: expected a mapping of keys to values, got a {type(content).__name__}")
-    return content or {}
-
-
-def list_presets() -> dict[str, Path]:
-    """Return the presets of `--config`: name (`presets/ppo`) and file."""
-    return {f"{registry.PRESETS.name}/{file.stem}": file for file in sorted(registry.PRESETS.glob("*.yaml"))}
-
-
-def find_config(config: Path) -> Path:
-    """Return the file of a `--config`: the path itself, or a preset's file if no file has that name.
-
-    Raises `ArtifactError` for a preset that does not exist.
-    """
-    if config.exists() or len(config.parts) != 2 or config.parts[0] != registry.PRESETS.name or config.suffix:
-        return config
-    file = registry.PRESETS / f"{config.name}.yaml"
-    check_name(str(config), list_presets(), "no preset", ArtifactError, listed="Presets")
-    return file
 
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.driven_joints import joint_name
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 from rlctl.replaying.bullet_bodies import BulletBody, name_bodies, read_bodies, read_body, read_pose, read_state
 from rlctl.replaying.look import BodySummary, JointSummary, Pose, Touch, WorldReader
 from rlctl.replaying.mujoco_scene import find_trunk_joint

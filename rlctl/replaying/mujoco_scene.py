@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.environments.driven_joints import joint_name
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 from rlctl.replaying.mjcf import Mesh, Shape, ShapeKind
 from rlctl.replaying.scene import BodyMotion, Env, Scene
 from rlctl.task.env import TaskEnv

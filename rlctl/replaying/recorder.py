@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from rlctl.environments import dict_spaces, registry
 from rlctl.environments.dict_spaces import map_parts, take_row
 from rlctl.environments.gym_worlds import GymWorlds
-from rlctl.environments.info import EnvInfo, describe, find_mujoco
+from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.simulations import find_mujoco
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, RlctlError, TaskError, describe_exception, format_plugin_traceback
 from rlctl.play.episode import EpisodeInfo, RecordedEpisode

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import output
-from rlctl.environments.info import describe_randomization
 from rlctl.errors import AnswerIsNo
 from rlctl.replaying.look import WorldSummary
 from rlctl.replaying.look_table import show_world
 from rlctl.replaying.reproduce import Verification
+from rlctl.task.events.event import describe_randomization
 from rlctl.version import collect_versions
 
 

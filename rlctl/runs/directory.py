@@ -82,7 +82,7 @@ class RunDirectory:
     def recipe(self) -> Recipe:
         """Read the resolved recipe; raises `ArtifactError` if it is missing or was changed later."""
         from rlctl.recipe.recipe import validate
-        from rlctl.recipe.sources import read
+        from rlctl.recipe.recipe_files import read
 
         if not self.recipe_file.exists():
             raise ArtifactError(

@@ -76,7 +76,8 @@ def _convert(value: Any) -> Any:
 
 
 def _describe_env(task: str, constructor: Any, env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
-    from rlctl.environments.info import describe_model, find_mujoco
+    from rlctl.environments.info import describe_model
+    from rlctl.environments.simulations import find_mujoco
     from rlctl.environments.wrappers import find_time_limit
     from rlctl.task.env import TaskEnv
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.check import CheckReport, check
 from rlctl.checking.rule import Severity
-from rlctl.checking.rules import find_rules
+from rlctl.checking.rule_index import find_rules
 from rlctl.environments import registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.registrations import describe_registrations

@@ -18,7 +18,8 @@ from rlctl.errors import ArtifactError, TaskError, UsageError, explain_missing_p
 from rlctl.launching.trainings import MakeTrainings, make_local_trainings
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import Recipe, fill_parameters
-from rlctl.recipe.sources import find_config, resolve_with_stages
+from rlctl.recipe.recipe_files import find_config
+from rlctl.recipe.sources import resolve_with_stages
 from rlctl.runs.directory import RunLock, create_group_folder
 from rlctl.runs.train_request import TrainRequest
 from rlctl.training.start import find_start, preserve_process_state

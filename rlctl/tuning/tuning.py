@@ -17,7 +17,8 @@ from rlctl.environments import registry
 from rlctl.environments.spec import merge
 from rlctl.errors import ArtifactError
 from rlctl.recipe.recipe import Recipe
-from rlctl.recipe.sources import read, resolve_with_stages
+from rlctl.recipe.recipe_files import read
+from rlctl.recipe.sources import resolve_with_stages
 from rlctl.runs.directory import TUNE_FILE, RunDirectory
 from rlctl.runs.group import find_run_of_seed
 from rlctl.runs.summary import RunSummary, summarize

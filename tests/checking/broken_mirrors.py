@@ -20,3 +20,10 @@ class RL120TurnsHipsTheSameWay(Walk):
 class RL120PrefersItsLeft(Walk):
     def rewards(self, action):
         return {**super().rewards(action), "tracking": 10.0 * self.turning[:, 2]}
+
+
+class MeasuresItsLeft(Walk):
+    reward_weights = {**Walk.reward_weights, "leftwards": 0.0}
+
+    def rewards(self, action):
+        return {**super().rewards(action), "leftwards": 10.0 * self.turning[:, 2]}

@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from rlctl.checking import children
+from rlctl.checking import child
 from rlctl.checking.check import judge
 from rlctl.checking.experiments.expressions import BY_EXPRESSIONS, noted_episodes
 from rlctl.checking.instance import Budget, Context
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import Records
-from rlctl.checking.rules import PROCESS_S, PROCESSES, RULES, find_needs
+from rlctl.checking.rule_index import EXPERIMENTS, PROCESS_S, PROCESSES, RULES, find_needs
 from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.spec import EnvSpec
 from rlctl.task.pybullet.library import pybullet
@@ -124,7 +124,12 @@ def _run(task, process, experiments):
         pybullet.disconnect(client)
     for module in [module for module in sys.modules if module.rpartition(".")[2].startswith("broken_")]:
         del sys.modules[module]
-    return list(children.run(process, EnvSpec(_path(task)), experiments, SECONDS)) if experiments else []
+    return list(run_here(process, _path(task), experiments, SECONDS)) if experiments else []
+
+
+def run_here(process, task, experiments, seconds, **options):
+    """Run experiments, by name, as a child process does."""
+    return child.run(process, EnvSpec(task), [EXPERIMENTS[name] for name in experiments], seconds, **options)
 
 
 def _path(task):

@@ -5,13 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from rlctl.checking import children
 from rlctl.checking.check import judge
 from rlctl.checking.progress import read_clock, read_clock_of
 from rlctl.checking.records import Records
-from rlctl.checking.rules import PROCESSES
-from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import FOLDER, found
+from rlctl.checking.rule_index import PROCESSES
+from tests.checking.judging import FOLDER, found, run_here
 
 LINUX = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="only Linux counts it")
 
@@ -37,7 +35,7 @@ def test_what_the_clock_cut_off_is_not_judged():
     of_absence = {"RL110", "RL501", "RL611", "RL612"}
     assert {rule for rule, _ in found("broken_repeats.py:NothingHappens", *of_absence)} == of_absence
     records, names = Records("slow"), PROCESSES["probe"]
-    for message in children.run("probe", EnvSpec(f"{FOLDER}/broken_repeats.py:NothingHappensSlowly"), names, 0.5):
+    for message in run_here("probe", f"{FOLDER}/broken_repeats.py:NothingHappensSlowly", names, 0.5):
         records.add(message)
     verdict = judge(records)
     assert not {finding.rule for finding in verdict.findings} & of_absence
@@ -61,7 +59,7 @@ def test_no_call_begins_when_the_time_of_the_process_is_over(tmp_path):
         "        super().start()\n"
     )
     records = Records("slow")
-    for message in children.run("instances", EnvSpec(f"{file}:Slow"), PROCESSES["instances"], 1.5):
+    for message in run_here("instances", f"{file}:Slow", PROCESSES["instances"], 1.5):
         records.add(message)
     assert len(resets.read_text()) <= 1.5 / 0.2 + 2
     assert "RL808" in {finding.rule for finding in records.findings}

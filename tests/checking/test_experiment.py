@@ -2,7 +2,7 @@
 
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
 from rlctl.checking.records import Skipped
-from rlctl.checking.rules import RULES
+from rlctl.checking.rule_index import RULES
 
 
 def test_parts_run_by_their_places_and_then_by_their_rules():

@@ -9,14 +9,14 @@ import gymnasium
 import numpy as np
 import pytest
 
-from rlctl.checking import children
+from rlctl.checking.child import TOO_DEEP
 from rlctl.checking.experiment import PROBE
 from rlctl.checking.expressions import record_expressions
 from rlctl.checking.records import Finished, Skipped
 from rlctl.checking.source_code import SourceCode
 from rlctl.checking.step_times import StepTimes
 from rlctl.checking.timed_expressions import Use, find_majority, find_timed_expressions
-from rlctl.environments.spec import EnvSpec
+from tests.checking.judging import run_here
 
 DT, SUBSTEPS = 0.1, 5
 H = DT / SUBSTEPS
@@ -194,7 +194,7 @@ class Deep(gymnasium.Env):
 
 def test_a_source_that_is_nested_too_deeply_is_not_judged(tmp_path):
     (tmp_path / "deep.py").write_text(DEEP.replace("SUM", " + ".join(["self.x[0]"] * 1500)))
-    messages = list(children.run(PROBE, EnvSpec(f"{tmp_path}/deep.py:Deep"), ["build", "expressions"], 10.0))
+    messages = list(run_here(PROBE, f"{tmp_path}/deep.py:Deep", ["build", "expressions"], 10.0))
     reasons = {message.reason for message in messages if isinstance(message, Skipped)}
-    assert reasons == {children.TOO_DEEP}
+    assert reasons == {TOO_DEEP}
     assert [message.crash for message in messages if isinstance(message, Finished)] == ["", ""]

@@ -23,7 +23,7 @@ from rlctl.checking.check import CheckReport, CheckVerdict, judge
 from rlctl.checking.formats import FORMATS, pair_targets, print_report, show_notes, to_text
 from rlctl.checking.records import Built, Finished, Records
 from rlctl.checking.rule import RuleFinding, Severity
-from rlctl.checking.rules import FAMILIES, PROCESSES, RULES, choose_rules, find_needs, find_rule
+from rlctl.checking.rule_index import FAMILIES, PROCESSES, RULES, choose_rules, find_needs, find_rule
 from rlctl.environments.leaves import find_leaves
 from rlctl.errors import UsageError
 from tests import fork_server

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.checking.check import check
-from rlctl.checking.rules import RULES
+from rlctl.checking.rule_index import RULES
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import case, check_case, findings, mark_slow, verdict_of
 

@@ -6,7 +6,7 @@ from rlctl.checking.check import judge
 from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from rlctl.checking.records import Records
 from rlctl.checking.rule import RuleFinding
-from rlctl.checking.rules import RULES
+from rlctl.checking.rule_index import RULES
 from tests.checking.judging import case, check_case, findings, found_in_source, mark_slow
 
 TURNED = {

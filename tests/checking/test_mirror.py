@@ -15,7 +15,7 @@ TWIN = f"{FILE}:RL120MirrorsTurning"
 CASES = [
     case(f"{FILE}:RL120MirrorsTurningLikeVectors", ("RL120", "error"), twin=TWIN, slow=True),
     case(f"{FILE}:RL120TurnsHipsTheSameWay", ("RL120", "error"), twin=TWIN),
-    case(f"{FILE}:RL120PrefersItsLeft", ("RL120", "error"), twin=TWIN),
+    case(f"{FILE}:RL120PrefersItsLeft", ("RL120", "error"), twin=f"{FILE}:MeasuresItsLeft"),
 ]
 
 
@@ -25,7 +25,9 @@ def test_finds_the_mistake_and_only_that(case):
 
 
 @pytest.mark.slow_except("walk")
-@pytest.mark.parametrize("task", ["walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk"])
+@pytest.mark.parametrize(
+    "task", ["walk", "walk-rough", "walk-stairs", "get-up", "humanoid-walk", "mini-walk", "quadruped-bow"]
+)
 def test_sound_declarations(task):
     assert found(task, "RL120") == set()
 

@@ -11,7 +11,7 @@ import pytest
 from rlctl.checking.check import check, judge
 from rlctl.checking.experiment import RecordsJudge
 from rlctl.checking.records import Records
-from rlctl.checking.rules import JUDGES, choose_rules
+from rlctl.checking.rule_index import JUDGES, choose_rules
 from rlctl.checking.tool_formats import read_baseline
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, UsageError

@@ -3,13 +3,16 @@
 Lives the environments in this process; what needs a process of its own is in `test_processes.py`.
 """
 
+import ast
 import re
+import subprocess
+import sys
 from importlib import import_module
 
 import pytest
 
-from rlctl.checking import rules
-from rlctl.checking.rules import EXPERIMENTS, PROCESSES, RULES, find_needs
+from rlctl.checking.experiment import index
+from rlctl.checking.rule_index import EXPERIMENTS, PROCESSES, RULES, find_modules, find_needs
 from rlctl.checking.values import find_numbers
 from tests.checking.judging import (
     FOLDER,
@@ -115,7 +118,24 @@ CASES = [
 
 def test_a_second_judge_of_a_rule_is_no_silent_replacement():
     with pytest.raises(ValueError, match=r"^RL104: two of str; one is enough$"):
-        rules._index([("RL103", "a"), ("RL104", "a"), ("RL104", "b")])
+        index([("RL103", "a"), ("RL104", "a"), ("RL104", "b")])
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_a_child_imports_all_parts_of_its_experiments_and_no_others(process):
+    modules = find_modules(PROCESSES[process])
+    code = (
+        "import sys; from rlctl.checking.experiment import import_experiments; "
+        f"print({{name: one.rules for name, one in import_experiments({modules}).items()}}); "
+        "print([name for name in sys.modules if '.rules.rl' in name and name not in sys.argv[1:]])"
+    )
+    command = [sys.executable, "-c", code, *modules]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    found = ast.literal_eval(printed[0])
+    assert {name: found[name] for name in PROCESSES[process]} == {
+        name: EXPERIMENTS[name].rules for name in PROCESSES[process]
+    }
+    assert ast.literal_eval(printed[1]) == []
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)

@@ -2,12 +2,11 @@
 
 import pytest
 
-from rlctl.checking import children
 from rlctl.checking.check import CheckReport, judge
 from rlctl.checking.formats import to_text
 from rlctl.checking.records import Finished, Records, Shortened
-from rlctl.checking.rules import PROCESS_S
-from rlctl.environments.spec import EnvSpec
+from rlctl.checking.rule_index import PROCESS_S
+from tests.checking.judging import run_here
 
 SLOW = """
 import time
@@ -43,7 +42,7 @@ def play(task, experiments, seconds, most_growth):
     records = Records(task)
     process = "probe"
     names = ["build", *experiments]
-    for message in children.run(process, EnvSpec(task), names, seconds, most_growth=most_growth):
+    for message in run_here(process, task, names, seconds, most_growth=most_growth):
         records.add(message)
     return records
 

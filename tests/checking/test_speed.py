@@ -11,7 +11,7 @@ from rlctl.checking.check import judge
 from rlctl.checking.experiments.speed import typical
 from rlctl.checking.profiling import Profile, Stopwatch, TimedCall
 from rlctl.checking.records import Records
-from rlctl.checking.rules import choose_rules
+from rlctl.checking.rule_index import choose_rules
 from rlctl.checking.speed import Speed, format_speed
 from tests.checking.judging import case, check_case, mark_slow, shared_records_of
 

@@ -10,7 +10,7 @@ from rlctl.checking.check import CheckReport, CheckVerdict
 from rlctl.checking.formats import show_notes
 from rlctl.checking.records import Built, Records
 from rlctl.checking.rule import RuleFinding
-from rlctl.checking.rules import RULES
+from rlctl.checking.rule_index import RULES
 from rlctl.checking.working_copy import find_outdated, find_working_copy, prefer_working_copy
 
 

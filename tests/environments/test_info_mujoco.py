@@ -7,7 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from rlctl.environments.info import describe, describe_mujoco_model, find_mujoco
+from rlctl.environments.info import describe
+from rlctl.environments.simulations import describe_mujoco_model, find_mujoco
 from rlctl.environments.spec import EnvSpec
 
 mujoco = pytest.importorskip("mujoco")

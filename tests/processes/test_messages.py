@@ -13,7 +13,7 @@ import pytest
 
 from rlctl.checking.records import Fact, Series
 from rlctl.checking.rule import RuleFinding, Severity
-from rlctl.checking.rules import RULES
+from rlctl.checking.rule_index import RULES
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.spec import EnvSpec
 from rlctl.play import messages

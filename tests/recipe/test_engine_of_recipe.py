@@ -5,7 +5,7 @@ import pytest
 import rlctl as api
 from rlctl.engine import MUJOCO, Engine
 from rlctl.errors import RecipeError, UsageError
-from rlctl.recipe.sources import make_spec
+from rlctl.recipe.recipe_files import make_spec
 
 POLE = """
 <mujoco>

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from rlctl.errors import ArtifactError
-from rlctl.recipe import sources
+from rlctl.recipe import recipe_files, sources
 from rlctl.task.env import TaskEnv
 from rlctl_locomotion.biped import Biped
 from rlctl_manipulation.gear_arm import GearArm
@@ -59,7 +59,7 @@ def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "presets").mkdir()
     (tmp_path / "presets" / "ppo").write_text("n_envs: 3\n")
-    assert sources.find_config(Path("presets/ppo")) == Path("presets/ppo")
+    assert recipe_files.find_config(Path("presets/ppo")) == Path("presets/ppo")
     assert sources.resolve("reach", Path("presets/ppo"), {}).n_envs == 3
 
 

@@ -6,12 +6,12 @@ import pytest
 
 from rlctl.environments.installed import list_installed
 from rlctl.launching.findings import warn_of_unusual_values
-from rlctl.recipe import sources
+from rlctl.recipe import recipe_files, sources
 from rlctl.runs.diagnosis import usual_ranges
 from rlctl.runs.train_request import TrainRequest
 
 RECIPES = [(entry.name, None) for entry in list_installed()]
-RECIPES += [("reach", Path(preset)) for preset in sources.list_presets()]
+RECIPES += [("reach", Path(preset)) for preset in recipe_files.list_presets()]
 
 
 @pytest.mark.parametrize(("task", "config"), RECIPES)

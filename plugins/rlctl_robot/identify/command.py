@@ -87,7 +87,7 @@ def identify(
             {"--fit": fit, "--columns": columns, "--timestep": timestep, "--output": output},
             "a robot's model file (.xml, .urdf)",
         )
-        from rlctl.recipe.sources import make_spec
+        from rlctl.recipe.recipe_files import make_spec
 
         spec = parse_changes(settings, sim).apply(make_spec(task))
         _identify_task(spec, log, excite, events, seconds or 10.0, seed, json)

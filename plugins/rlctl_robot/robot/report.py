@@ -7,8 +7,8 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from rlctl import output
-from rlctl.environments.info import describe_randomization
 from rlctl.evaluation.eval_request import Gates
+from rlctl.task.events.event import describe_randomization
 from rlctl.version import collect_versions
 from rlctl_robot.robot.robot import FaultScore, RobotReport
 

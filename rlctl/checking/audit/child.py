@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from rlctl.checking import children
+from rlctl.checking import child
 from rlctl.checking.audit.competitors import Competitor, Kind, Plays, check_instance, list_competitors
-from rlctl.checking.experiment import Experiment
+from rlctl.checking.experiment import Experiment, import_experiments
 from rlctl.checking.instance import MOST_FAILURES, Context, EnvironmentRaised, describe_failure
 from rlctl.checking.progress import CallProgress
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Skipped
 from rlctl.checking.rule import NotJudged
-from rlctl.checking.rules import EXPERIMENTS
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError
 
@@ -25,6 +24,7 @@ def main(
     process: str,
     spec: EnvSpec,
     experiments: list[str],
+    modules: list[str],
     seconds: float,
     most_growth: float,
     memory: int,
@@ -44,9 +44,9 @@ def main(
         own_rules=(),
         hooks=(),
     )
-    known = {**EXPERIMENTS, AUDIT: own}
-    messages = children.run(process, spec, experiments, seconds, CallProgress(memory), most_growth, known)
-    children.send_all(connection, messages)
+    known = {**import_experiments(modules), AUDIT: own}
+    chosen = [known[name] for name in experiments]
+    child.send_all(connection, child.run(process, spec, chosen, seconds, CallProgress(memory), most_growth))
 
 
 def play_rounds(

@@ -36,7 +36,7 @@ from rlctl.checking.values import (
 from rlctl.checking.worlds import JOINTS, World
 from rlctl.environments.bullet_calls import BulletCalls, record_calls
 from rlctl.environments.bullet_clients import ClientCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 EPISODES = ("random", "repeated", "extreme", "random", "zero", "zero", "zero")
 """How the actions of each episode are chosen; with none for robots only whose reward has terms about steps."""

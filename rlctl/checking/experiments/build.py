@@ -23,10 +23,10 @@ from rlctl.checking.values import find_assignment, find_author, is_task
 from rlctl.environments.bullet_clients import find_clients
 from rlctl.environments.dict_spaces import format_space
 from rlctl.environments.graphics import opengl_fix
-from rlctl.environments.info import describe_mujoco_model
 from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import find_line, is_own_file
 from rlctl.environments.registrations import describe_registrations
+from rlctl.environments.simulations import describe_mujoco_model
 from rlctl.errors import NoSuchClassError, OldGymError, RlctlError, TaskError, UsageError, read_message
 
 WAIVERS = "rlctl_ignore"  # The class attribute that waives rules: rule id -> reason
@@ -119,7 +119,7 @@ def _describe_built(instance: Instance) -> Built:
     file: str | None = None
     line: int | None = None
     with contextlib.suppress(OSError, TypeError):
-        file, line = inspect.getsourcefile(author), inspect.getsourcelines(author)[1]
+        file, line = inspect.getsourcefile(author), inspect.findsource(author)[1] + 1
     return Built(
         leaves=instance.leaves,
         action_leaves=instance.action_leaves,

@@ -21,7 +21,7 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats
 from rlctl.environments.bullet_clients import ClientCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 STEPS, STEPS_WITHOUT_LIMIT = 450, 1_100  # of an episode that declares a time limit, and of any other
 SEEDS = 3

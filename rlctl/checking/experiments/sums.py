@@ -19,7 +19,7 @@ from rlctl.checking.transitions import flatten_floats, name_floats
 from rlctl.checking.values import flatten_action, read_attributes
 from rlctl.checking.worlds import JOINTS, Array
 from rlctl.environments.bullet_calls import BulletCalls, record_calls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RANDOM_STEPS, FEWEST_STEPS = 16, 10
 SAME = 1e-3  # part of the largest change: what float32 makes of an action

@@ -23,7 +23,7 @@ from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import flatten_floats
 from rlctl.checking.values import find_numbers
 from rlctl.environments.bullet_clients import ClientCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 from rlctl.task.rotations import from_axis, multiply, roll_pitch_yaw, rotate
 
 PLANE = 0  # MuJoCo's type of a geom

@@ -9,6 +9,7 @@ from rlctl.checking.records import ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.environments import registry
 from rlctl.errors import RecipeError
+from rlctl.recipe.recipe_files import read
 
 RULE = Rule(
     "RL012",
@@ -39,8 +40,6 @@ def _find_stages(name: str, task: Any) -> Sequence[Any]:
     file = registry.find_recipe_file(name)
     stages = task.stages
     if file is not None and "stages" in file.read_text(encoding="utf-8", errors="replace"):
-        from rlctl.recipe.sources import read  # pydantic's models take a quarter of a second to load
-
         stages = read(file).get("stages", stages)
     return stages if isinstance(stages, list | tuple) else ()  # another type is refused with the recipe
 

@@ -14,7 +14,7 @@ from rlctl.checking.instance import EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.values import flatten
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 from rlctl.task.body import Body
 from rlctl.task.events import Event
 from rlctl.task.events.event import Widening

@@ -103,8 +103,9 @@ class _Trial:
         self._call("is_terminated", worlds.calls.is_terminated, step=step)
         terms = self._call("rewards", worlds.rewards, rows, step=step)[0, 1:]
         observed = self._call("observe", self.env.observe_exactly, step=step)
-        named = zip(worlds.weights, terms.tolist(), strict=True)
-        return {**observed, **{f"reward term {name}": np.array([value]) for name, value in named}}
+        weighted = zip(worlds.weights.items(), terms.tolist(), strict=True)
+        paid = {name: value for (name, weight), value in weighted if weight}  # others may measure a place in the world
+        return {**observed, **{f"reward term {name}": np.array([value]) for name, value in paid.items()}}
 
     def _call(self, name: str, function: Any, *arguments: Any, step: int = 0) -> Any:
         values = self._instance.call(name, function, *arguments, step=step)

@@ -19,7 +19,7 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.worlds import ORIENTATION, Array, Link, Poses, World
 from rlctl.checking.wrong_turns import find_broken_turns, find_wrong_turns
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL125",

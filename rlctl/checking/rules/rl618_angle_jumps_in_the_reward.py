@@ -48,7 +48,7 @@ _SHIFTS = [shift for shift in range(-NEIGHBOURS, NEIGHBOURS + 1) if shift]
 
 TURNS, HALVINGS = 12, 10  # headings all around, and how often the interval of the largest change is halved
 TURNED_SEEDS, MOST_SEEDS, MOST_STEADY = 2, 4, 1
-"""Starts that have to show it; and of a goal, that are tried, and that may not: with the heading 0 nothing jumps."""
+"""Starts that have to show it, that are tried, and that may not: where heading 0 is wanted, nothing jumps."""
 DIRECTIONS, CLEARLY = 24, 3.0  # of a goal, and how much more the reward has to change at pi than between any others
 DISTANCE = 0.5  # part of the goals' range, at which a goal is moved around the robot
 LARGE_JUMP = 0.5  # part of that change which is left then: of a smooth function it is a thousandth
@@ -86,15 +86,28 @@ def _turn_differences(notes: NotedEpisodes) -> Iterator[RuleFinding]:
 @judges_turned(RULE, decides=False)
 def _turn_around(robot: TurnedRobot) -> Iterator[RuleFinding]:
     """Yield a finding where the reward jumps at the heading pi, from whatever start."""
-    sizes: list[float] = []
-    for number in range(TURNED_SEEDS):
-        start = robot.play(number, 0.0)
-        jump = None if start is None else _find_jump(functools.partial(_pay_turned, robot, number, start.heading))
-        if jump is None:
-            return
-        sizes.append(jump)
-    message = f"the reward jumps by {sizes[0]:.3g} where the heading of the robot passes from pi to -pi"
-    yield RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": sizes[0], "expected": "no jump"})
+    if (found := _find_jump_of_starts(functools.partial(_find_turned_jump, robot))) is not None:
+        seed, jump = found
+        message = f"the reward jumps by {jump:.3g} where the heading of the robot passes from pi to -pi"
+        yield RuleFinding(RULE, message, {"seed": seed, "value": jump, "expected": "no jump"})
+
+
+def _find_jump_of_starts(find: Callable[[int], float | None]) -> tuple[int, float] | None:
+    """Return the seed of a start and the first jump that `find` returns for its number; None if too few have one."""
+    found: list[tuple[int, float]] = []
+    for number in range(MOST_SEEDS):
+        if (jump := find(number)) is not None:
+            found.append((FIRST_SEED + number, jump))
+        if len(found) == TURNED_SEEDS:
+            return found[0]
+        if number + 1 - len(found) > MOST_STEADY:
+            return None
+    return None
+
+
+def _find_turned_jump(robot: TurnedRobot, number: int) -> float | None:
+    start = robot.play(number, 0.0)
+    return None if start is None else _find_jump(functools.partial(_pay_turned, robot, number, start.heading))
 
 
 def _pay_turned(robot: TurnedRobot, number: int, start: float, heading: float) -> float:
@@ -109,22 +122,12 @@ def _move_goal_around(trials: GoalTrials) -> Iterator[RuleFinding]:
     source = next((one for one in sources if one is not None), None)
     if source is None or trials.drawn.place.size < 2 or trials.drawn.place.is_pose:
         return
-    sizes: list[float] = []
-    for number in range(MOST_SEEDS):
-        if number - len(sizes) > MOST_STEADY:
-            return
-        seed = FIRST_SEED + number
-        episode = GoalEpisode(trials, seed, "repeated", PLACED_STEPS)
-        jump = None if episode.has_ended else _find_goal_jump(trials, source, seed)
-        sizes += [] if jump is None else [jump]
-        if len(sizes) == TURNED_SEEDS or trials.instance.context.budget.is_over():
-            break
-    if len(sizes) < TURNED_SEEDS:
+    found = _find_jump_of_starts(functools.partial(_find_goal_jump, trials, source))
+    if found is None:
         return
-    message = (
-        f"the reward jumps by {sizes[0]:.3g} where the direction of {trials.drawn.name} from the robot passes from"
-    )
-    evidence = {"element": trials.drawn.name, "seed": FIRST_SEED, "value": sizes[0], "expected": "no jump"}
+    seed, jump = found
+    message = f"the reward jumps by {jump:.3g} where the direction of {trials.drawn.name} from the robot passes from"
+    evidence = {"element": trials.drawn.name, "seed": seed, "value": jump, "expected": "no jump"}
     yield RuleFinding(RULE, f"{message} pi to -pi", evidence)
 
 
@@ -138,8 +141,12 @@ def _pay_goal(trials: GoalTrials, source: Source, seed: int, direction: float) -
     return steps[-1].reward if len(steps) == 2 else np.nan
 
 
-def _find_goal_jump(trials: GoalTrials, source: Source, seed: int) -> float | None:
-    """Return how much the reward jumps with the goal in the direction pi; None if it changes as much elsewhere."""
+def _find_goal_jump(trials: GoalTrials, source: Source, number: int) -> float | None:
+    """Return how much the reward jumps with the goal in the direction pi; None if it changes as much elsewhere, and
+    if no time is left."""
+    seed = FIRST_SEED + number
+    if trials.instance.context.budget.is_over() or GoalEpisode(trials, seed, "repeated", PLACED_STEPS).has_ended:
+        return None
     width = 2 * np.pi / DIRECTIONS
     directions = np.pi + width * (np.arange(DIRECTIONS) + 0.5)
     paid = np.array([_pay_goal(trials, source, seed, float(direction)) for direction in directions])

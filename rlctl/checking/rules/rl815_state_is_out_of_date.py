@@ -31,7 +31,7 @@ from rlctl.checking.shared_frames import name_elements, name_part
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL815",

@@ -10,7 +10,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.worlds import Array
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL817",

@@ -8,7 +8,7 @@ import numpy as np
 from rlctl.checking.experiments.worlds import MujocoTrials, judges_trials
 from rlctl.checking.mujoco_trials import name_columns, pair_rows, play
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL818",

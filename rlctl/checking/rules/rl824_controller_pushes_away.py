@@ -11,7 +11,7 @@ from rlctl.checking.mujoco_worlds import MujocoStateReader, copy_data, library
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.worlds import Array
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL824",

@@ -20,7 +20,7 @@ from rlctl.checking.source_code import write_code
 from rlctl.checking.term_names import is_paid, split_name
 from rlctl.checking.world_logs import LoggedWorld
 from rlctl.checking.worlds import Array
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL834",

@@ -7,7 +7,7 @@ from rlctl.checking.experiments.build import judges_built
 from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_worlds import SLIDE
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
-from rlctl.environments.info import find_mujoco
+from rlctl.environments.simulations import find_mujoco
 
 RULE = Rule(
     "RL840",

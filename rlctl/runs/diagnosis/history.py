@@ -14,7 +14,7 @@ from rlctl.environments.info import EnvInfo
 from rlctl.errors import RlctlError
 from rlctl.play.episode import RecordedEpisode, load_episode
 from rlctl.policy.file import PolicyFile
-from rlctl.recipe import recipe, sources
+from rlctl.recipe import recipe, recipe_files
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.runs.diagnosis import usual_ranges
 from rlctl.runs.diagnosis.usual_ranges import Setting
@@ -142,7 +142,7 @@ class RunHistory:
 
 
 def _read_recipe(path: Path) -> dict[str, Any]:
-    content = sources.read(path)
+    content = recipe_files.read(path)
     recipe.validate(content, str(path))
     return content
 

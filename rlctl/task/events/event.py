@@ -285,3 +285,10 @@ class EventSettings:
             elif event.enabled or self.randomize:
                 active[name] = bound
         return active
+
+
+def describe_randomization(events: Mapping[str, bool]) -> str:
+    """Return `randomised by NAMES` or `not randomised`; empty for an environment without events."""
+    if acting := [name for name, acts in events.items() if acts]:
+        return f"randomised by {', '.join(acting)}"
+    return "not randomised" if events else ""
