@@ -187,14 +187,19 @@ def _find_other_strengths(world: LoggedWorld) -> Iterator[RuleFinding]:
 
 
 def _find_other_ranges(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding]:
-    """Yield a motor that the action drives over the limits of another joint, which differ from those of its own."""
+    """Yield a motor that the action drives over the limits of another joint, which differ from those of its own.
+
+    The other's motor, too, has to be driven over limits that are not its own: one range may equal one by chance.
+    """
     holding = [span for span in spans if span.motor.holds_position and span.motor.joint.has_limits]
     swapped = []
     for span, other in itertools.permutations(holding, 2):
         if covers(span, other.motor) and not covers(span, span.motor) and not covers(span, span.motor, DEGREE):
             swapped.append((span, other))
-    if len({span.motor.number for span, _ in swapped}) >= 2:
-        span, other = swapped[0]
+    numbers = {span.motor.number for span, _ in swapped}
+    in_cycle = [(span, other) for span, other in swapped if other.motor.number in numbers]
+    if len({span.motor.number for span, _ in in_cycle}) >= 2:
+        span, other = in_cycle[0]
         joint, reach = span.motor.joint, other.motor.joint
         limits = f"over [{span.low:.3g}, {span.high:.3g}], the limits of joint {reach.name}"
         own = f"those of its own joint {joint.name} are [{joint.low:.3g}, {joint.high:.3g}]"
