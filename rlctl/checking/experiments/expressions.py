@@ -31,6 +31,7 @@ EPISODES = ("random", "zero", "extreme", "random", "rare")
 """How the actions of each episode are chosen."""
 STEPS = 80  # of an episode
 LONGEST_S = 10.0  # for episodes that are played again [s]
+CLEARLY = 10.0  # times the difference that the same episode has when it is played again
 MOST_NOTED = 300_000  # values; no episode begins after so many
 
 
@@ -47,6 +48,16 @@ def read_observation(moment: Moment) -> NDArray[np.float64]:
 def read_step(moment: Moment) -> NDArray[np.float64]:
     """Return what a step pays and shows, and whether it ends the episode."""
     return np.concatenate([read_reward(moment), moment.flags, read_observation(moment)])
+
+
+def _compare(one: list[NDArray[np.float64]], other: list[NDArray[np.float64]], tolerance: float) -> float | None:
+    """Return the largest difference of what both have, 0 within a tolerance; None where they cannot be compared."""
+    pairs = list(zip(one, other, strict=False))
+    if not pairs or not all(_are_comparable(before, after) for before, after in pairs):
+        return None
+    if all(np.allclose(*pair, rtol=tolerance, atol=tolerance, equal_nan=True) for pair in pairs):
+        return 0.0
+    return float(max(np.nanmax(np.abs(before - after)) for before, after in pairs))
 
 
 def _are_comparable(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
@@ -104,16 +115,22 @@ class NotedEpisodes:
         tolerance: float = 0.0,
     ) -> bool | None:
         """Say whether something that is read of a step of an episode, or of so many later ones, is another where
-        expressions are worth what `other` has in it, instead of what `one` has; None where that is not known.
+        expressions are worth what `other` has in it, instead of what `one` has; None where that is not known, also
+        where the same episode played once more is about as different.
 
         `forced` has values of other steps, `tolerance` is relative and absolute.
         """
-        played = [self.play(number, step + later, {**forced, step: values})[step:] for values in (one, other)]
-        pairs = [(read(before), read(after)) for (_, before), (_, after) in zip(*played, strict=False)]
-        if not pairs or not all(_are_comparable(before, after) for before, after in pairs):
-            return None
-        close = functools.partial(np.allclose, rtol=tolerance, atol=tolerance, equal_nan=True)
-        return not all(close(before, after) for before, after in pairs)
+
+        def look(values: Mapping[int, Any]) -> list[NDArray[np.float64]]:
+            played = self.play(number, step + later, {**forced, step: values})
+            return [read(moment) for _, moment in played[step:]]
+
+        before, after = look(one), look(other)
+        difference = _compare(before, after, tolerance)
+        if not difference:
+            return None if difference is None else False
+        again = _compare(before, look(one), tolerance)
+        return None if again is None or difference < CLEARLY * again else True
 
     def share(self, reader: Callable[["NotedEpisodes"], Reader]) -> Reader:
         """Return what a class reads of the episodes, which is made once for all judges."""
