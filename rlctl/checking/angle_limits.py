@@ -132,8 +132,8 @@ def _read_literal(node: ast.expr) -> float | None:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            value = _read_literal(operand)
-            return None if value is None else -value
+            found = _read_literal(operand)
+            return None if found is None else -found
     return None
 
 
