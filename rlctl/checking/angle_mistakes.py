@@ -3,6 +3,7 @@
 import ast
 from collections.abc import Iterator, Mapping
 
+from rlctl.checking.angle_limits import AngleLimits
 from rlctl.checking.angle_readings import STATES, AngleReadings
 from rlctl.checking.angle_units import Angle, Unit, list_factors, read_words
 from rlctl.checking.assignments import list_assignments, read_key, read_name
@@ -39,6 +40,7 @@ class AngleMistakes:
                     self._read_given(node, function)
             self._read_assigned(function)
         found = [self._make(one.node, one.what) for one in self.readings.mixed.values() if not one.takes_radians]
+        found += [self._make(*entry) for entry in AngleLimits(noted).find_compared()]
         self.of_functions = [
             self._make(one.node, one.what) for one in self.readings.mixed.values() if one.takes_radians
         ]

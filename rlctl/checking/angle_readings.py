@@ -233,14 +233,14 @@ class AngleReadings:
         node, name = place.node, read_name(place.node)
         if isinstance(node, ast.Attribute) and name in STATES:
             return Angle(Unit.RADIANS, f"what {name} holds")
-        several = self._list_definitions(place)
+        several = self.list_definitions(place)
         found = unite([self._read(one) for one, _ in several])
         if found is not None and found.unit is not Unit.NUMBER:
             return found
         comments = [self._read_comment(one.node, element) for one, element in several]
         return read_words(name) or unite([one for one in comments if one is not None]) or found
 
-    def _list_definitions(self, place: ReadExpression) -> list[tuple[ReadExpression, int | None]]:
+    def list_definitions(self, place: ReadExpression) -> list[tuple[ReadExpression, int | None]]:
         """Return what a name stands for, and which element of it."""
         node = place.node
         several = self.definitions.follow(place)
@@ -253,7 +253,7 @@ class AngleReadings:
             several = [ReadExpression(one, self.source.find_function(one), {}, place.depth) for one in values]
         if several or is_local:
             return [(one, None) for one in several]
-        constants = self._constants.get(read_name(node), ())
+        constants = self.constants.get(read_name(node), ())
         return [(ReadExpression(value, place.function), element) for value, element in constants]
 
     def _is_inside(self, node: ast.AST) -> bool:
@@ -262,7 +262,7 @@ class AngleReadings:
         return isinstance(node, Function)
 
     @functools.cached_property
-    def _constants(self) -> dict[str, list[tuple[ast.expr, int | None]]]:
+    def constants(self) -> dict[str, list[tuple[ast.expr, int | None]]]:
         """What modules and classes set outside their functions, by its name."""
         found: dict[str, list[tuple[ast.expr, int | None]]] = {}
         for tree in self.source.trees.values():

@@ -31,6 +31,7 @@ FREE_BASE = ("getBaseVelocity", ".set_base(", ".base_velocity")
 TASK_VELOCITIES = {"base_velocity", "base_angular_velocity"}
 """Of a body of a task: both are in the axes of the world, as PyBullet's."""
 ALONG, ASIDE = 0.15, 0.4  # part of a motion that a velocity leaves over
+WORSE = 20.0  # times what the right one leaves over; small turns leave 4 times as much after two as after one
 
 
 class WorldVectors:
@@ -209,11 +210,8 @@ class WorldVectors:
                 continue
             episodes = np.repeat(self.series.episodes[1:][steps], rows.shape[1])[known]
             changing = [_center(vectors[known], episodes) for vectors in (moved, old)]
-            if (
-                _measure_rest(moved[known], old[known]) < ALONG
-                and _measure_rest(*changing) < ASIDE
-                and _measure_rest(moved[known], new[known]) > ASIDE
-            ):
+            rest, other = (_measure_rest(moved[known], vectors[known]) for vectors in (old, new))
+            if rest < ALONG and _measure_rest(*changing) < ASIDE and other > min(ASIDE, WORSE * rest + SAME):
                 return True
         return False
 

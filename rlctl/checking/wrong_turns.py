@@ -1,6 +1,7 @@
 """Where the source turns a vector of the world by an orientation itself, instead of its inverse."""
 
 import ast
+import dataclasses
 import functools
 from collections.abc import Iterator
 
@@ -37,6 +38,24 @@ class TurnedVectors:
         return {by for turn, by in backwards if self.world.explain(turn) is not None}
 
 
+@dataclasses.dataclass(frozen=True)
+class _OfWorld:
+    """A turn of a vector of the world by an angle that counts in a direction which is not known."""
+
+    turn: VectorTurn
+    sign: int
+    by: str
+    what: str
+
+    @property
+    def is_way(self) -> bool:
+        return self.what.startswith(WAY)
+
+    @property
+    def line(self) -> int:
+        return self.turn.whole.node.lineno
+
+
 def find_mixed_frames(rule: Rule, turned: TurnedVectors) -> Iterator[RuleFinding]:
     """Yield the axes of the body, turned by the inverse, that are multiplied with a vector of the world."""
     rights_3d = {one.text for one in turned.series.orientations}
@@ -62,17 +81,19 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
         (turn, found, what or (f"{WAY} {turn.text}" if (_read_start(turn), found[1]) in starts else None))
         for turn, found, what in explained
     ]
-    rights = turned.rights | {
-        found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)
-    }
+    told = {found[1] for turn, found, _ in explained if found[0] > 0 and world.is_velocity(turn.turned_back)}
     seen, rights_3d = set[int](), {one.text for one in series.orientations}
+    untold = list[_OfWorld]()
     for turn, (sign, by), what in explained:
-        if sign < 0 or what is None or turn.whole.number in seen:
+        if what is None or turn.whole.number in seen:
             continue
         is_angle = turn.before.shape[2] == 2 or by not in rights_3d
-        is_told = bool(list_words(turn.whole.node) & WORLD_WORDS) or by in rights or directions.has_engine
+        is_told = bool(list_words(turn.whole.node) & WORLD_WORDS) or by in told or directions.has_engine
         if is_angle and not is_told and not directions.counts_forwards(by):
+            untold.append(_OfWorld(turn, sign, by, what))
             continue  # the angle may count the other way round, as that of a compass
+        if sign < 0:
+            continue
         seen.add(turn.whole.number)
         if what.startswith(WAY) == of_ways:
             message = (
@@ -81,6 +102,27 @@ def find_wrong_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Ite
             message += " and the vector is one of the world already"
             evidence = {"element": turn.whole.text, "value": turn.text}
             yield RuleFinding(rule, message, evidence, where=turn.whole.where, same=FRAME_RULES)
+    yield from (_tell_opposite(rule, *pair) for pair in _find_opposites(untold) if pair[0].is_way == of_ways)
+
+
+def _find_opposites(untold: list[_OfWorld]) -> Iterator[tuple[_OfWorld, _OfWorld]]:
+    """Yield a vector of the world that is turned by the same angle in the other direction than another one: whichever
+    way the angle counts, one is wrong. It is that of the direction of which there are fewer, or the last in the file.
+    """
+    for by in dict.fromkeys(one.by for one in untold):
+        own = [[one for one in untold if (one.by, one.sign) == (by, sign)] for sign in (1, -1)]
+        if all(own):
+            few, several = sorted(own, key=lambda side: (len({one.turn.whole.text for one in side}), -side[-1].line))
+            yield few[-1], several[0]
+
+
+def _tell_opposite(rule: Rule, one: _OfWorld, other: _OfWorld) -> RuleFinding:
+    whole = one.turn.whole
+    message = f"{whole.text} turns {one.turn.text}, {one.what}, by {one.by} in the other direction than"
+    message += f" {other.turn.whole.text} (line {other.line}) turns {other.turn.text}, {other.what}:"
+    message += " both are vectors of the world, and cannot be in one frame then"
+    evidence = {"element": whole.text, "value": one.turn.text}
+    return RuleFinding(rule, message, evidence, where=whole.where, same=FRAME_RULES)
 
 
 def find_broken_turns(rule: Rule, turned: TurnedVectors, *, of_ways: bool) -> Iterator[RuleFinding]:

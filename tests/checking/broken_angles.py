@@ -8,6 +8,7 @@ from robots import Boat
 
 LIMITS = {"heading_deg": 150.0}
 DRIFT = 0.5  # deg
+FARTHEST, MOST_HEEL = 2.0, 15.0
 D2R = math.pi / 180.0
 
 
@@ -100,3 +101,57 @@ class RL126BoatLooksAsideInDegrees(BoatLooksAside):
         x, y = self.buoy - self.place
         c, s = math.cos(self.lamp_deg), math.sin(self.lamp_deg)
         return Boat.reward(self) + 0.05 * (c * x + s * y)
+
+
+class BoatHeels(Boat):
+    """It leans over where it turns, and may not lean far."""
+
+    def __init__(self, most=40.0):
+        self.most = most
+        super().__init__()
+
+    def start(self):
+        super().start()
+        self.heel = 0.0
+
+    def move(self, action):
+        super().move(action)
+        self.heel += 0.2 * (self.speed[1] - self.heel)
+
+    def observed(self):
+        return (*super().observed(), "sin heel", "cos heel")
+
+    def observe(self):
+        return np.append(super().observe(), [np.sin(self.heel), np.cos(self.heel)]).astype(np.float32)
+
+    def is_success(self):
+        return super().is_success() and self.distance() < FARTHEST and self.is_upright()
+
+    def is_upright(self):
+        return abs(self.heel) < np.deg2rad(MOST_HEEL)
+
+
+class RL132BoatHeelsAnyhow(BoatHeels):
+    def is_upright(self):
+        return abs(self.heel) < MOST_HEEL
+
+
+class BoatHeelsBetweenKeywords(BoatHeels):
+    def is_upright(self):
+        return -self.most < self.heel < self.most
+
+
+class BoatLooksAnywhere(BoatHeels):
+    def is_upright(self):
+        x, y = self.buoy - self.place
+        error = wrap(math.atan2(y, x) - self.heading)
+        return not abs(error) > 30
+
+
+class BoatLooksAhead(BoatHeels):
+    """Its limit is in degrees, as what it is compared with; a round number of radians guards its heel."""
+
+    def is_upright(self):
+        x, y = self.buoy - self.place
+        error = math.degrees(wrap(math.atan2(y, x) - self.heading))
+        return abs(error) < self.most and abs(self.heel) < 100.0

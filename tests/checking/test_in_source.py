@@ -18,7 +18,11 @@ SHOWN = {
         "RL132BoatByCompassInRadians": ("RL132", "BoatByCompass"),
         "RL132BoatKeepsItsCoursePerDegree": ("RL132", "BoatKeepsItsCourse"),
         "RL126BoatLooksAsideInDegrees": ("RL126", "BoatLooksAside"),
+        "RL132BoatHeelsAnyhow": ("RL132", "BoatHeels"),
+        "BoatHeelsBetweenKeywords": ("RL132", "BoatHeels"),
+        "BoatLooksAnywhere": ("RL132", "BoatLooksAhead"),
     },
+    "without_engine/broken_compass.py": {"KayakTurnsItsSpeedBack": ("RL124", "Kayak")},
     "broken_early.py": {
         "RaftKeepsFirst": ("RL642", "Raft"),
         "RaftHeadingOfTheModel": ("RL642", "RaftNominal"),

@@ -34,7 +34,8 @@ RULE = Rule(
         read from its attributes: its velocity is what changes its position, its frame the one in which its actions
         push it, or the orientation that its angular velocity turns. Or a line of the source does so: it turns a
         vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse, with a
-        way in the world; or a turn in the plane that is written by elements has one wrong sign, and turns nothing.
+        way in the world; or it turns one vector of the world by an angle in the other direction than another one; or a
+        turn in the plane that is written by elements has one wrong sign, and turns nothing.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
