@@ -220,6 +220,9 @@ class BoundReader:
             is_low, lowest = _find_limit(-given, -places_of_robot, -low)
             is_high, highest = _find_limit(given, places_of_robot, high)
             if is_low.any() or is_high.any():
+                # What is the value of the clip itself is limited at its other end, too.
+                is_itself = (np.abs(places_of_robot - clipped) < SAME).all(axis=0) & (is_low | is_high)
+                is_low, is_high = is_low | is_itself, is_high | is_itself
                 text = one.text if len(one.text) < LONGEST_TEXT else "np.clip"
                 ends = np.where(is_low, -lowest, -np.inf), np.where(is_high, highest, np.inf)
                 return Bound(*ends, f"{text} keeps it there")

@@ -26,9 +26,9 @@ RULE = Rule(
         Some of the goals that reset draws are further away than the robot ever came, although it came equally
         far in many directions: the edge of its workspace. Those episodes cannot succeed, whatever is learned,
         and the success rate that can be reached is below 100 %. An error if all goals are too far, such as
-        goals in millimetres. Or the source computes the reward from the distance of two places, and one of them is
-        further than the other one gets: by the limits of the joints, or by what the source clips; also the
-        position of one joint.
+        goals in millimetres. Or the source computes the reward from the distance of two places, or of the position
+        of a joint and its goal, and one of them is further than the other one gets: by the limits of the joints,
+        or by what the source clips.
     """,
     fix="""
         Draw goals inside the workspace: from random joint positions, or a smaller radius. Lengths are in
