@@ -31,8 +31,8 @@ RULE = Rule(
         statements and never the one beside it, also of an attribute that follows the action. An error if no element
         does anything else: there is nothing to learn. An info if the reward of the own step can also rise, as in a
         bandit, if the source compares the element, as that of a gripper, or if all values in one half of the range do
-        the same; a warning where that is so for every element, or where the source clips more than a quarter of the range
-        at one end, and does not compare the element.
+        the same; a warning where that is so for every element, or where the source clips more than a quarter of the
+        range at one end, and does not compare the element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
