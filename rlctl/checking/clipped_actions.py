@@ -26,7 +26,7 @@ INSIDE = 0.98  # part of the dead range
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Followed:
+class ClippedExpression:
     """An expression one element of which is a linear function of one number of the action, between two limits."""
 
     expression: Expression
@@ -41,7 +41,7 @@ class ClippedAction:
     """A number of the action, a part of whose range has no effect."""
 
     dimension: ActionNumber
-    followed: Followed
+    followed: ClippedExpression
 
 
 class ActionFollowers:
@@ -62,7 +62,7 @@ class ActionFollowers:
         that is observed follows that part. What the source compares, as to fire an engine, is meant."""
         if not self.dimensions or len(self.steps) < FEWEST:
             return
-        found: dict[int, Followed] = {}
+        found: dict[int, ClippedExpression] = {}
         for one in self._list_calls():
             for followed in self._follow(one):
                 if followed.part > LEAST_DEAD:
@@ -80,7 +80,7 @@ class ActionFollowers:
         known = (self.notes.source.expressions[number] for number in first)
         return [one for one in known if isinstance(one.node, ast.Call)]
 
-    def _follow(self, one: Expression) -> Iterator[Followed]:
+    def _follow(self, one: Expression) -> Iterator[ClippedExpression]:
         """Yield the elements of an expression that follow the action between two limits."""
         noted = [(call.values.get(one.number, [None])[-1], action) for call, action in self.steps]
         known = [(np.ravel(value), action) for value, action in noted if value is not None]
@@ -91,7 +91,7 @@ class ActionFollowers:
             if np.isfinite(row).all() and np.ptp(row) > 0:
                 yield from (found for column in self.dimensions if (found := self._fit(one, row, actions, column)))
 
-    def _fit(self, one: Expression, row: Array, actions: Array, column: int) -> Followed | None:
+    def _fit(self, one: Expression, row: Array, actions: Array, column: int) -> ClippedExpression | None:
         low, high, rounding = row.min(), row.max(), EXACT * np.ptp(row)
         inner = (row > low + rounding) & (row < high - rounding)
         given = actions[:, column]
@@ -108,7 +108,7 @@ class ActionFollowers:
         at_end = np.abs(row - row[given.argmax() if side else given.argmin()]) <= rounding
         is_one_sided = parts[1 - side] <= parts[side] / 2 and at_end.sum() >= FEWEST_AT_END
         dead = (borders[1], ends[1]) if side else (ends[0], borders[0])
-        return Followed(one, column, dead, float(row[at_end][0]), parts[side] if is_one_sided else 0.0)
+        return ClippedExpression(one, column, dead, float(row[at_end][0]), parts[side] if is_one_sided else 0.0)
 
     def _list_compared(self) -> set[int]:
         """Return the numbers of the action that the source compares, where that is true at times."""
@@ -123,7 +123,7 @@ class ActionFollowers:
             found |= {followed.column for side in sides if side is not None for followed in self._follow(side)}
         return found
 
-    def _is_dead(self, dimension: ActionNumber, followed: Followed) -> bool:
+    def _is_dead(self, dimension: ActionNumber, followed: ClippedExpression) -> bool:
         """Say whether the dead part does the same everywhere, and the rest does not."""
         trials = Trials(self.notes.instance)
         low, high = dimension.bounds
