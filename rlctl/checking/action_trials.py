@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_actions, zero_action
 from rlctl.checking.instance import Instance
-from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import NotJudged, OutOfTime
 from rlctl.checking.values import flatten, flatten_action
 from rlctl.environments.leaves import Leaf, name_element, pick
@@ -19,6 +19,8 @@ Frame = NDArray[np.float64]
 """What one call of reset or step returned: the observation's numbers, flat, the reward, and the two flags."""
 
 REPEATED_STEPS = 20
+STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
+LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
 REWARD = -3  # Where the reward is in a frame
 
 
@@ -127,6 +129,12 @@ class Trials:
         if episode.ended == "raised":
             raise NotJudged("step does not return observation, reward and flags (RL201)")
         return frames
+
+    def has_same_effect(self, dimension: ActionNumber, one: Any, two: Any) -> bool:
+        """Say whether two values of a number of the action, in all steps, lead to the same, but for its own copies."""
+        copies = self.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
+        played = ([self.with_values(*stage, {dimension: value}) for value in (one, two)] for stage in STAGES)
+        return not any(observations_differ(a, b, copies) for a, b in played)
 
     def copies(self, dimension: ActionNumber, seed: int, steps: int, longest_delay: int) -> list[int]:
         """Return the columns of a frame that only repeat this number of an earlier action."""

@@ -2,23 +2,26 @@
 robot gets, by the joints of its model or by what the source clips."""
 
 import ast
-import dataclasses
 import functools
+import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.assignments import read_name
+from rlctl.checking.compared_places import Bound, ComparedPlaces
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiments.expressions import EPISODES, NotedEpisodes
 from rlctl.checking.expressions import NotedCall
 from rlctl.checking.goal_distances import DistanceReader, GoalDistance
+from rlctl.checking.joint_places import find_span, read_limited_joints
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.source_code import Expression
 from rlctl.checking.summands import Summand
 from rlctl.checking.vector_series import SAME
 from rlctl.checking.workspaces import Chain, find_chains, measure_box
+from rlctl.checking.worlds import Joint
 from rlctl.environments.bullet_clients import ClientCalls
 
 Array = NDArray[np.float64]
@@ -32,32 +35,10 @@ FEWEST = 10  # steps in which both places are known
 LAG = 0.15  # part of a clipped range by which a place may be off
 FEWEST_CLIPPED, CLEARLY = 3, 3.0  # steps; how many times further beyond an end what is clipped is than the robot
 LONGEST_TEXT = 60
+MOST_AXES = 8
+PLANES_AND_SPACE = (2, 3)  # axes of places that links have
+OVER = 0.05  # part of a joint's range by which it may be beyond its limits
 LEAST_MOTION = 1e-3  # range of a place that moves
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class ComparedPlaces:
-    """What a distance is measured between, in each step of each episode: NaN where it was not."""
-
-    distance: GoalDistance
-    robot: Expression
-    goal: Expression
-    robots: Sequence[Array]  # by episode. Shape (steps, axes)
-    goals: Sequence[Array]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Bound:
-    """Between what coordinates a place of the robot gets. Shape (axes,)."""
-
-    low: Array  # infinite where it is not known
-    high: Array
-    how: str  # this is known
-
-    def list_ends(self) -> Iterator[tuple[int, int, float]]:
-        """Yield axis, sign and coordinate of each end that is known."""
-        for sign, ends in ((-1, self.low), (1, self.high)):
-            yield from ((axis, sign, end) for axis, end in enumerate(ends.tolist()) if np.isfinite(end))
 
 
 class BoundReader:
@@ -101,7 +82,7 @@ class BoundReader:
         return float(np.sign(summand.weight) * from_mean.prod(axis=1).mean())
 
     def _read(self, one: Expression | None) -> list[Array] | None:
-        """Return what an expression of two or three elements was worth at the end of each step, by episode."""
+        """Return what an expression of a few elements was worth at the end of each step, by episode."""
         return self._read_all(one, [episode[1:] for episode in self.notes.episodes]) if one is not None else None
 
     def _read_all(self, one: Expression, episodes: Sequence[Sequence[NotedCall]]) -> list[Array] | None:
@@ -109,22 +90,46 @@ class BoundReader:
         for calls in episodes:
             values = [call.values.get(one.number, [None])[-1] for call in calls]
             sizes = {np.shape(value) for value in values if value is not None}
-            if len(sizes) != 1 or not sizes <= {(2,), (3,)}:
+            if len(sizes) != 1 or len(shape := sizes.pop()) > 1 or not 0 < math.prod(shape) <= MOST_AXES:
                 return None
-            missing = np.full(sizes.pop(), np.nan)
-            found.append(np.array([missing if value is None else value for value in values]))
+            missing = np.full(math.prod(shape), np.nan)
+            found.append(np.array([missing if value is None else np.ravel(value) for value in values]))
         return found
 
     def list_bounds(self, places: ComparedPlaces) -> Iterator[Bound]:
         """Yield what limits where the place of the robot gets."""
         rows = np.concatenate(places.robots)
         rows = rows[np.isfinite(rows).all(axis=1)]
-        if len(rows) < FEWEST or np.ptp(rows, axis=0).max() < LEAST_MOTION:
+        if len(rows) < FEWEST or np.ptp(rows, axis=0).max() < LEAST_MOTION or not places.may_be_fixed:
             return
-        bounds = [self._find_by_joints(places), self._find_by_clips(places)]
+        finders = (self._find_by_positions, self._find_by_joints, self._find_by_clips)
+        bounds = (find(places) for find in finders)
         yield from (one for one in bounds if one is not None)
 
+    def _find_by_positions(self, places: ComparedPlaces) -> Bound | None:
+        """Return the ends between which the limits of joints keep what is the position of one of them."""
+        instance = self.notes.instance
+        if not read_limited_joints(instance.env, instance.find_clients()):
+            return None
+        rows = self._read_all(places.robot, [[call for call, _, _ in steps] for steps in self._samples])
+        if rows is None:
+            return None
+        looks = [joints for steps in self._samples for _, _, joints in steps]
+        spans = [find_span(column, looks) for column in np.concatenate(rows).T]
+        if not any(spans):
+            return None
+        ends = [(-np.inf, np.inf, np.inf) if one is None else (one.low, one.high, one.period) for one in spans]
+        low, high, periods = np.array(ends).T
+        robots = np.concatenate(places.robots)
+        beyond = np.fmax(np.nanmax(robots, axis=0) - high, low - np.nanmin(robots, axis=0))
+        if (beyond > OVER * (high - low)).any():
+            return None  # it is placed, whatever the limits
+        names = ", ".join(dict.fromkeys(one.joint for one in spans if one is not None))
+        return Bound(low, high, f"the limits of {names} keep it there", periods)
+
     def _find_by_joints(self, places: ComparedPlaces) -> Bound | None:
+        if places.robots[0].shape[1] not in PLANES_AND_SPACE:
+            return None
         for number, chain in enumerate(self._chains):
             robots, _ = self._compare_links(places.robot, number)
             goals, _ = self._compare_links(places.goal, number)
@@ -144,31 +149,33 @@ class BoundReader:
         return list(find_chains(instance.env, instance.find_clients()))
 
     @functools.cached_property
-    def _samples(self) -> list[list[tuple[NotedCall, list[Array]]]]:
-        """Steps of more episodes, and where the links of each chain were after them."""
-        found: list[list[tuple[NotedCall, list[Array]]]] = []
+    def _samples(self) -> list[list[tuple[NotedCall, list[Array], list[tuple[str, Joint, float]]]]]:
+        """Steps of more episodes, and where the links of each chain and the joints with limits were after them."""
+        found: list[list[tuple[NotedCall, list[Array], list[tuple[str, Joint, float]]]]] = []
         recorder, instance = self.notes.recorder, self.notes.instance
         for number in TRIED:
             kind = EPISODES[number % len(EPISODES)]
             player = EpisodePlayer(instance, FIRST_SEED + number, kind, number=number, max_steps=STEPS)
             player.reset()
+            clients = instance.find_clients()
             found.append([])
             while not player.ended:
                 with recorder.call(player.steps + 1) as noted:
                     player.step()
-                chains = find_chains(instance.env, instance.find_clients())
-                found[-1].append((noted, [chain.read() for chain in chains]))
+                chains = find_chains(instance.env, clients)
+                joints = read_limited_joints(instance.env, clients)
+                found[-1].append((noted, [chain.read() for chain in chains], joints))
         return found
 
     def list_goals(self, places: ComparedPlaces) -> list[Array]:
         """Return the place of the goal in each step of all episodes that were played, by episode."""
-        more = [[call for call, _ in steps] for steps in self._samples]
+        more = [[call for call, _, _ in steps] for steps in self._samples]
         return [*places.goals, *(self._read_all(places.goal, more) or ())]
 
     def _compare_links(self, one: Expression, number: int) -> tuple[dict[int, float], int]:
         """Return the links of a chain that a place always has the same distance to, with that distance [m]."""
         steps = [step for episode in self._samples for step in episode]
-        pairs = [(noted.values.get(one.number, [None])[-1], links[number]) for noted, links in steps]
+        pairs = [(noted.values.get(one.number, [None])[-1], links[number]) for noted, links, _ in steps]
         known = [(np.asarray(value), links) for value, links in pairs if value is not None and np.shape(value)]
         if len(known) < FEWEST:
             return {}, 0
@@ -213,6 +220,9 @@ class BoundReader:
             is_low, lowest = _find_limit(-given, -places_of_robot, -low)
             is_high, highest = _find_limit(given, places_of_robot, high)
             if is_low.any() or is_high.any():
+                # What is the value of the clip itself is limited at its other end, too.
+                is_itself = (np.abs(places_of_robot - clipped) < SAME).all(axis=0) & (is_low | is_high)
+                is_low, is_high = is_low | is_itself, is_high | is_itself
                 text = one.text if len(one.text) < LONGEST_TEXT else "np.clip"
                 ends = np.where(is_low, -lowest, -np.inf), np.where(is_high, highest, np.inf)
                 return Bound(*ends, f"{text} keeps it there")

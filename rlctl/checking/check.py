@@ -275,13 +275,14 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 
 
 def _findings(rule: str, records: Records) -> list[RuleFinding]:
-    """Return the findings of a rule; those by expressions of the source only where it has found nothing else, and
-    experiments nothing for the rules that find the same."""
+    """Return the findings of a rule; those by expressions of the source only where it has found nothing else but infos,
+    and experiments nothing for the rules that find the same."""
     found: set[str] = {finding.rule for finding in records.findings}
     by_expressions: list[RuleFinding] = records.facts.get(BY_EXPRESSIONS, [])
     of_source = [one for one in by_expressions if one.rule == rule and not found & set(one.same)]
     try:
-        return _find_played(rule, records) or of_source
+        played = _find_played(rule, records)
+        return of_source if of_source and all(one.severity is Severity.INFO for one in played) else played
     except (NotJudged, NotApplicable):
         if not of_source:
             raise

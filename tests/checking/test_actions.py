@@ -20,7 +20,7 @@ CASES = [
     case(f"{FILE}:RL701OnlyCopies", ("RL701", "error"), twin=f"{FILE}:RL701Switch"),
     case(f"{FILE}:RL705ChangesAction", ("RL705", "warning"), slow=True),
     case(f"{FILE}:RL705ChangesPartOfAction", ("RL705", "warning"), slow=True),
-    case("broken_robots.py:RL701ArmPullsOnly", ("RL701", "info"), twin="robots.py:Arm"),
+    case("broken_robots.py:RL701ArmPullsOnly", ("RL701", "warning"), twin="robots.py:Arm"),
     case("broken_robots.py:RL701BoatForwardOnly", ("RL701", "warning"), twin="robots.py:Boat"),
 ]
 CASES += [

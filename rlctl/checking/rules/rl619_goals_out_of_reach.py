@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from rlctl.checking import rewards
-from rlctl.checking.bounded_places import Bound, BoundReader, ComparedPlaces
+from rlctl.checking.bounded_places import BoundReader
+from rlctl.checking.compared_places import FIXED, MOSTLY_FIXED, Bound, ComparedPlaces
 from rlctl.checking.drawn_goals import DrawnGoal, Numbers, Source, find_sources, read_place
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
@@ -25,8 +26,9 @@ RULE = Rule(
         Some of the goals that reset draws are further away than the robot ever came, although it came equally
         far in many directions: the edge of its workspace. Those episodes cannot succeed, whatever is learned,
         and the success rate that can be reached is below 100 %. An error if all goals are too far, such as
-        goals in millimetres. Or the source computes the reward from the distance of two places, and one of them is
-        further than the other one gets: by the limits of the joints, or by what the source clips.
+        goals in millimetres. Or the source computes the reward from the distance of two places, or of the position
+        of a joint and its goal, and one of them is further than the other one gets: by the limits of the joints,
+        or by what the source clips.
     """,
     fix="""
         Draw goals inside the workspace: from random joint positions, or a smaller radius. Lengths are in
@@ -39,7 +41,6 @@ UNKNOWN_TOLERANCE = 0.1  # part of the reach
 HARDLY_MOVES = 0.25  # part of the longest range of coordinates of the robot
 VERY_FAR = 2.0  # times the reach
 FEWEST_FAR, FEWEST_SUCCESSES = 2, 3
-FIXED, MOSTLY_FIXED = 1e-3, 0.8  # motion of a goal that does not move [m], and the part of the episodes with one
 
 
 @judges_expressions(RULE, decides=False)
@@ -63,7 +64,7 @@ def _compare_with_bound(reader: BoundReader, places: ComparedPlaces, bound: Boun
         if tolerance is None and is_still:
             continue  # such as a hand that stays above the table
         allowed = UNKNOWN_TOLERANCE * sizes[axis] if tolerance is None else tolerance + MARGIN * sizes[axis]
-        rows = [goal[np.isfinite(goal[:, axis]), axis] for goal in goals]
+        rows = [bound.wrap(axis, goal[np.isfinite(goal[:, axis]), axis]) for goal in goals]
         fixed = [row for row in rows if row.size and np.ptp(row) < FIXED]
         if len(fixed) < MOSTLY_FIXED * len(rows):
             continue  # it may come to the robot
@@ -71,9 +72,9 @@ def _compare_with_bound(reader: BoundReader, places: ComparedPlaces, bound: Boun
         far = [one for one in beyond if one > allowed]
         are_all = len(far) == len(beyond)
         if len(far) >= FEWEST_FAR and not (are_all and tolerance is None):
-            name, farthest = f"{places.goal.text}[{axis}]", end + sign * max(far)
+            name, farthest = places.name(places.goal, axis), end + sign * max(far)
             message = f"{name} is out of reach in {len(far)} of {len(beyond)} episodes, up to {farthest:.4g}:"
-            message += f" {places.robot.text}[{axis}] gets to {end:.4g} at most; {bound.how}"
+            message += f" {places.name(places.robot, axis)} gets to {end:.4g} at most; {bound.how}"
             evidence = {"element": name, "value": farthest, "expected": end}
             severity = Severity.ERROR if are_all else None
             yield RuleFinding(RULE, message, evidence, severity, where=places.distance.expression.where)

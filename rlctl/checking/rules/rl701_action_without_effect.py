@@ -8,8 +8,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from rlctl.checking import action_trials
-from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
+from rlctl.checking.action_trials import LONGEST_DELAY, REWARD, STAGES, ActionNumber, Trials
 from rlctl.checking.assignments import list_values
+from rlctl.checking.clipped_actions import ActionFollowers, ClippedAction
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
@@ -30,7 +31,8 @@ RULE = Rule(
         statements and never the one beside it, also of an attribute that follows the action. An error if no element
         does anything else: there is nothing to learn. An info if the reward of the own step can also rise, as in a
         bandit, if the source compares the element, as that of a gripper, or if all values in one half of the range do
-        the same; a warning where that is so for every element.
+        the same; a warning where that is so for every element, or where the source clips more than a quarter of the
+        range at one end, and does not compare the element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
@@ -44,8 +46,6 @@ WHOLE_RANGE = (
 )
 MOST_DIMENSIONS = 64
 ACTION_NAMES = {"a", "action", "actions", "act", "u", "cmd", "command", "ctrl"}
-STAGES = ((FIRST_SEED, 3), (FIRST_SEED, 20), (SECOND_SEED, 60))  # seeds and steps, until a difference shows
-LONGEST_DELAY = 4  # steps; for earlier actions in observations and for penalties on changes
 Effect = Literal["lasting", "reward", "cost", "copy", "none"]
 """Of a number of the action: on what follows; only on its step's reward, up or, as a cost, down; only on its own copy
 in the observation; or nothing."""
@@ -57,7 +57,17 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
     size = int(np.prod(shape or 0))
     found = find_unread_elements(RULE, noted.source, noted.of_steps, size)
     followers = find_unread_followers(RULE, noted.definitions, noted.turned.series, noted.of_steps, size)
-    yield from itertools.islice(itertools.chain(found, followers), 1)
+    clipped = map(_describe_clipped, ActionFollowers(noted).find_clipped())
+    yield from itertools.islice(itertools.chain(found, followers, clipped), 1)
+
+
+def _describe_clipped(clipped: ClippedAction) -> RuleFinding:
+    followed, name = clipped.followed, clipped.dimension.name
+    low, high = followed.dead
+    dead = f"{name} from {low:.4g} to {high:.4g} has no effect, {followed.part:.0%} of its range"
+    message = f"{dead}: {followed.expression.text} is {followed.limit:.4g} there"
+    evidence = {"element": name, "value": [low, high]}
+    return RuleFinding(RULE, message, evidence, fix=WHOLE_RANGE, where=followed.expression.where)
 
 
 @judges_actions(RULE)
@@ -128,11 +138,9 @@ def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
 
 def _find_dead_half(trials: Trials, dimension: ActionNumber) -> list[str]:
     low, high = dimension.ends
-    copies = trials.copies(dimension, FIRST_SEED, action_trials.REPEATED_STEPS, LONGEST_DELAY)
 
     def is_same(one: float, two: float) -> bool:
-        played = ([trials.with_values(*stage, {dimension: value}) for value in (one, two)] for stage in STAGES)
-        return not any(action_trials.observations_differ(a, b, copies) for a, b in played)
+        return trials.has_same_effect(dimension, one, two)
 
     middle = (low + high) / 2
     for end, other in ((low, high), (high, low)) if "float" in dimension.leaf.dtype else ():
