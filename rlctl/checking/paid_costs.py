@@ -131,10 +131,12 @@ class CostReader:
     def _is_failure(self, summand: Summand) -> bool:
         """Say whether it is a flag that is called after a failure, or a constant that counts where one is true."""
         values = self._list_values(summand.place)
-        if self.reward.numbers.read_constant(summand.place.node) is not None:
+        constant = self.reward.numbers.read_constant(summand.place.node)
+        if constant is not None:
             tests = [test for test, is_true in summand.conditions if is_true]
             tests += [part for test in tests for part in read_joined(test)]
-            return any(isinstance(test, ast.Name) and _is_named_failure(test.id) for test in tests)
+            named = any(isinstance(test, ast.Name) and _is_named_failure(test.id) for test in tests)
+            return constant > 0 and named
         is_flag = bool(values.size) and set(values.tolist()) <= {0.0, 1.0}
         words = self._list_words(summand)
         is_meant = isinstance(summand.place.node, ast.UnaryOp) or bool(words & MEANT_WORDS)

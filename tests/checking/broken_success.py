@@ -110,6 +110,20 @@ class BoatIsPaidForItsRest(BoatSpares):
         return -self.distance() + 0.05 * (1 - effort) ** 2
 
 
+class BoatStopsPaying(BoatTurnsSlowly):
+    """Nothing is paid for its speed where it is lost."""
+
+    def reward(self):
+        lost = bool(self.distance() > 3.0)
+        return -self.distance() + (0.0 if lost else 0.1 * self.speed[0])
+
+
+class BoatIsPaidForBeingLost(BoatTurnsSlowly):
+    def reward(self):
+        lost = bool(self.distance() > 3.0)
+        return -self.distance() + (5.0 if lost else 0.1 * self.speed[0])
+
+
 class BoatLimitsItsTurns(BoatTurnsSlowly):
     def reward(self):
         return -self.distance() - 0.1 * abs(np.clip(self.speed[1], -0.5, 0.5))

@@ -144,6 +144,7 @@ SHOWN = {
         "BoatLeavesItsCourse": ("RL634", "BoatKeepsCourse"),
         "RL647BoatForgetsItsTurns": ("RL647", "BoatTurnsSlowly"),
         "BoatSpends": ("RL621", "BoatSpares"),
+        "BoatIsPaidForBeingLost": ("RL621", "BoatStopsPaying"),
         "BoatLimitsItsTurnsTheWrongWay": ("RL645", "BoatLimitsItsTurns"),
         "BoatCountsNoVisits": ("RL620", "BoatCountsVisits"),
         "BoatTurnsOnSinceTheStart": ("RL637", "BoatTurnsOn"),
