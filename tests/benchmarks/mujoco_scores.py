@@ -269,7 +269,7 @@ def draw(rows: list[Row], target: Path) -> None:
         for training in sorted({row.training for row in rows if row.environment == environment}):
             curve = sorted((row.steps / 1000, row.score) for row in rows if row.training == training)
             (lines[training[1]],) = axes.plot(*zip(*curve, strict=True), color=f"C{tools.index(training[1])}")
-    figure.axes[0].legend(lines.values(), lines, frameon=False)
+    figure.legend(lines.values(), lines, frameon=False, loc="outside lower center", ncols=len(lines))
     figure.savefig(target, dpi=110)
 
 
