@@ -29,7 +29,9 @@ class Directions:
 
     def __init__(self, series: VectorSeries) -> None:
         self.series = series
-        nodes = (node for tree in series.source.trees.values() for node in ast.walk(tree))
+        numbers = set[int]().union(*(call.values for call in series.calls))
+        files = {series.source.expressions[number].where[0] for number in numbers}  # that were run, not all of a folder
+        nodes = (node for file, tree in series.source.trees.items() if file in files for node in ast.walk(tree))
         imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
         self._libraries = {word for node in imports for word in ast.unparse(node).replace(".", " ").split()}
         self.has_engine = bool(self._libraries & {"mujoco", "pybullet", "rlctl"})

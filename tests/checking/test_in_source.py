@@ -22,7 +22,7 @@ SHOWN = {
         "BoatHeelsBetweenKeywords": ("RL132", "BoatHeels"),
         "BoatLooksAnywhere": ("RL132", "BoatLooksAhead"),
     },
-    "without_engine/broken_compass.py": {"KayakTurnsItsSpeedBack": ("RL124", "Kayak")},
+    "broken_compass.py": {"KayakTurnsItsSpeedBack": ("RL124", "Kayak")},
     "broken_early.py": {
         "RaftKeepsFirst": ("RL642", "Raft"),
         "RaftHeadingOfTheModel": ("RL642", "RaftNominal"),

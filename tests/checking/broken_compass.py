@@ -1,5 +1,4 @@
-"""A kayak whose heading is that of a compass, with a vector that one line turns the other way than the others. It is in
-a folder of its own, as angles of engines count in a direction that is known."""
+"""A kayak whose heading is that of a compass, with a vector that one line turns the other way than the others."""
 
 import gymnasium
 import numpy as np
