@@ -9,7 +9,7 @@ from rlctl.checking.term_names import split_name
 from rlctl.environments.simulations import find_mujoco
 
 FREE = 0  # MuJoCo's type of a joint
-OTHER_NAMES = {"vel", "velocity", "v"}  # of what is linear, if nothing else is said
+OTHER_NAMES = {"vel", "velocity", "v"}  # of linear velocities, without a word for an angular one
 LINEAR, ANGULAR = (
     {"lin", "linear", "slip", "speed", "linvel"},
     {"ang", "angular", "omega", "gyro", "rot", "rate", "spin", "turn", "yaw", "w"},

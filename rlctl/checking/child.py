@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 
 from gymnasium import spaces
@@ -30,20 +30,16 @@ def main(
     seconds: float,
     most_growth: float,
     memory: int,
+    own: Mapping[str, Experiment] = {},
 ) -> None:
-    """Run some experiments of one process and send what they yield.
+    """Run some experiments of one process, and send what they yield and that this was all.
 
     `modules` define them and the parts of rules in them: nothing else is imported, as most of a check of a fast
-    environment is imports. `memory`: the descriptor of the progress.
+    environment is imports. `memory`: the descriptor of the progress. `own`: experiments that no module has, by name.
     """
-    known = import_experiments(modules)
+    known = {**import_experiments(modules), **own}
     chosen = [known[name] for name in experiments]
-    send_all(connection, run(process, spec, chosen, seconds, CallProgress(memory), most_growth))
-
-
-def send_all(connection: Connection, messages: Iterator[ChildMessage]) -> None:
-    """Send what a child process yields, and that this was all."""
-    for message in messages:
+    for message in run(process, spec, chosen, seconds, CallProgress(memory), most_growth):
         send(connection, message)
     send(connection, End())
 

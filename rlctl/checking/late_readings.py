@@ -14,7 +14,6 @@ from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.early_readings import CHANCE_WORDS, CLOCKS, PHYSICS
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Value
-from rlctl.checking.observed_frames import ObservedCode
 from rlctl.checking.previous_values import PREVIOUS_WORDS, TIME_NAMES, is_goal, read_sides
 from rlctl.checking.source_code import Expression
 from rlctl.checking.term_names import ACTION_WORDS, split_name
@@ -232,8 +231,7 @@ class LateReadings:
     def _observed(self) -> set[ast.AST]:
         """The code of which the observation is made, also what is subtracted or turned for it, and what its local names
         stand for."""
-        turned = self.noted.turned
-        waiting = list(ObservedCode(turned.series, self.definitions, turned.turns).nodes)
+        waiting = list(self.noted.observed.nodes)
         found = set[ast.AST]()
         while waiting:
             node = waiting.pop()

@@ -8,7 +8,7 @@ import numpy as np
 
 from rlctl.checking.assignments import read_name
 from rlctl.checking.definitions import Definitions
-from rlctl.checking.observed_frames import ObservedCode
+from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.rule import Rule, RuleFinding
 from rlctl.checking.turned_expressions import VectorTurn
 from rlctl.checking.vector_series import SAME, VectorSeries
@@ -45,20 +45,20 @@ def _is_added_to_place(turned: TurnedVectors, turn: VectorTurn, by: str) -> bool
     return False
 
 
-def find_lone_turns(rule: Rule, turned: TurnedVectors, definitions: Definitions) -> Iterator[RuleFinding]:
+def find_lone_turns(rule: Rule, noted: NotedEpisodes) -> Iterator[RuleFinding]:
     """Yield the vector of an observation that is turned by an orientation itself while the others are turned by the
     inverse, or the other way round."""
-    observed = ObservedCode(turned.series, definitions, turned.turns)
+    series = noted.turned.series
     ways = collections.defaultdict[str, dict[bool, list[ast.expr]]](lambda: {True: [], False: []})
-    for node in observed.nodes:
-        way = _read_way(turned.series, definitions, node)
+    for node in noted.observed.nodes:
+        way = _read_way(series, noted.definitions, node)
         if way is not None and ast.unparse(node) not in map(ast.unparse, ways[way[0]][way[1]]):
             ways[way[0]][way[1]].append(node)
     for by, found in ways.items():
         several, few = sorted(found.values(), key=len, reverse=True)
         if len(few) != 1 or len(several) < 2:
             continue
-        one = turned.series.source.find(few[0])
+        one = noted.source.find(few[0])
         if one is not None:
             others = ", ".join(ast.unparse(node) for node in several[:2])
             message = f"{one.text} turns a vector of the observation by {by} in the other direction than {others}:"

@@ -151,12 +151,11 @@ def _is_vertical(index: ast.expr) -> bool:
     return False
 
 
-def find_world_vectors(rule: Rule, turned: TurnedVectors, definitions: Definitions) -> Iterator[RuleFinding]:
+def find_world_vectors(rule: Rule, turned: TurnedVectors, observed: ObservedCode) -> Iterator[RuleFinding]:
     """Yield the first vector of the world in an observation that has others in the frame of the robot, or that the
     source turns into that frame elsewhere, if it does not show its heading, with which episodes begin in all
     directions."""
     series, directions, world = turned.series, turned.directions, turned.world
-    observed = ObservedCode(series, definitions, turned.turns)
     if any(SEEN_WORDS & list_words(node) for node in observed.nodes):
         return
     inside = {turn.whole.node for turn in turned.turns} & set(observed.nodes)

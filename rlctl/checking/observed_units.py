@@ -8,7 +8,7 @@ from rlctl.checking.angle_readings import TAKING_RADIANS, AngleReadings
 from rlctl.checking.angle_units import DEGREE_WORDS, Angle, Unit, list_factors
 from rlctl.checking.assignments import list_words, peel, read_name
 from rlctl.checking.experiments.expressions import NotedEpisodes
-from rlctl.checking.observed_frames import DEEPEST, ObservedCode
+from rlctl.checking.observed_frames import DEEPEST
 from rlctl.checking.rule import Rule, RuleFinding
 
 LEAST_FACTOR = 0.1  # of degrees, that is not a scale that makes them small
@@ -18,10 +18,9 @@ class ObservedUnits:
     """The units of what an observation is made of."""
 
     def __init__(self, noted: NotedEpisodes) -> None:
-        turned = noted.turned
         self._source, self._definitions = noted.source, noted.definitions
         self._readings = noted.share(AngleReadings)
-        self._observed = ObservedCode(turned.series, noted.definitions, turned.turns)
+        self._observed = noted.observed
         self._seen: set[ast.expr] = set()
         self._angles = [entry for root in self._observed.roots for entry in self._list(root, 0)]
 

@@ -9,7 +9,6 @@ from rlctl.checking.assignments import Assignment, read_key, read_name, read_wor
 from rlctl.checking.early_readings import NOMINAL_WORDS, EarlyReadings, Repeatable, RepeatWatch, differ
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.late_readings import MEANT_WORDS, is_relative
-from rlctl.checking.observed_frames import ObservedCode
 from rlctl.checking.source_code import Expression
 from rlctl.checking.stale_values import FIRST_WORDS
 
@@ -76,8 +75,7 @@ class StartReadings:
 
     @functools.cached_property
     def _roots(self) -> list[ast.expr]:
-        turned = self.noted.turned
-        return list(ObservedCode(turned.series, self.definitions, turned.turns).nodes)
+        return self.noted.observed.nodes
 
     def _find_read(self, key: str) -> Expression | None:
         """Return where the observation shows an attribute by itself, as it is or scaled."""

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from rlctl.checking import child
 from rlctl.checking.audit.competitors import Competitor, Kind, Plays, check_instance, list_competitors
-from rlctl.checking.experiment import Experiment, import_experiments
+from rlctl.checking.experiment import Experiment
 from rlctl.checking.instance import MOST_FAILURES, Context, EnvironmentRaised, describe_failure
-from rlctl.checking.progress import CallProgress
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Skipped
 from rlctl.checking.rule import NotJudged
 from rlctl.environments.spec import EnvSpec
@@ -44,9 +43,7 @@ def main(
         own_rules=(),
         hooks=(),
     )
-    known = {**import_experiments(modules), AUDIT: own}
-    chosen = [known[name] for name in experiments]
-    child.send_all(connection, child.run(process, spec, chosen, seconds, CallProgress(memory), most_growth))
+    child.main(connection, process, spec, experiments, modules, seconds, most_growth, memory, {AUDIT: own})
 
 
 def play_rounds(

@@ -16,6 +16,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.experiment import INSTANCES, JudgeHook, experiment
 from rlctl.checking.expressions import ExpressionRecorder, NotedCall, record_expressions
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
+from rlctl.checking.observed_frames import ObservedCode
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact
 from rlctl.checking.rule import NotApplicable, RuleFinding
@@ -179,6 +180,11 @@ class NotedEpisodes:
     def turned(self) -> TurnedVectors:
         """The vectors that the source turns."""
         return TurnedVectors(VectorSeries(self.source, self.episodes), self.definitions)
+
+    @functools.cached_property
+    def observed(self) -> ObservedCode:
+        """The pieces of code of which an observation is made."""
+        return ObservedCode(self.turned.series, self.definitions, self.turned.turns)
 
     @functools.cached_property
     def reward(self) -> RewardReader:

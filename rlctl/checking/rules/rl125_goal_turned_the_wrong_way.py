@@ -57,7 +57,7 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
         find_wrong_turns(RULE, turned, of_ways=True),
         find_wrong_points(RULE, turned),
         find_broken_turns(RULE, turned, of_ways=True),
-        () if any(find_wrong_turns(RULE, turned, of_ways=False)) else find_lone_turns(RULE, turned, noted.definitions),
+        () if any(find_wrong_turns(RULE, turned, of_ways=False)) else find_lone_turns(RULE, noted),
     )
     yield from itertools.islice(found, 1)
 

@@ -46,7 +46,7 @@ TINY = 1e-4  # of rewards
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    yield from itertools.islice(find_world_vectors(RULE, noted.turned, noted.definitions), 1)
+    yield from itertools.islice(find_world_vectors(RULE, noted.turned, noted.observed), 1)
 
 
 @judges_rotated(RULE)
