@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlctl.checking.assignments import Assignment, peel
+from rlctl.checking.definitions import Definitions
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.previous_values import KeptDifference, KeptDifferences, is_goal, is_previous_key
@@ -77,7 +78,7 @@ class GoalDraws:
     def is_new_goal(self, key: str, assignment: Assignment) -> bool:
         """Say whether an assignment sets a goal: by its name, as it is drawn, or as the next one of several."""
         is_next = _counts(assignment) or self._takes_next(assignment)
-        return is_goal(key) or is_next or self._draws(assignment)
+        return is_goal(key) or is_next or is_drawn(self.definitions, assignment.value, assignment.function)
 
     def _adds_up(self, one: KeptDifference, key: str) -> bool:
         """Say whether the new value has the rest of the way behind the next goal: it then goes on without a jump."""
@@ -118,10 +119,6 @@ class GoalDraws:
                 keys = self.definitions.list_reads(index, assignment.function)
                 return any(_counts(one) for key in keys for one in self.definitions.assigned.get(key, ()))
         return False
-
-    def _draws(self, assignment: Assignment) -> bool:
-        tops = [top for top, _ in self.definitions.list_sources(assignment.value, assignment.function)]
-        return any(is_draw(node) for top in tops for node in ast.walk(top))
 
     @functools.cached_property
     def _evaluated(self) -> set[int]:
@@ -215,6 +212,16 @@ def _is_mask(value: Value) -> bool:
 def is_draw(node: ast.AST) -> bool:
     """Say whether code calls a random generator."""
     return isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in DRAWS
+
+
+def has_draw(node: ast.AST) -> bool:
+    """Say whether there is such a call in some code."""
+    return any(map(is_draw, ast.walk(node)))
+
+
+def is_drawn(definitions: Definitions, node: ast.AST, function: Function) -> bool:
+    """Say whether there is one in code, in what its names are given, or in the functions that it calls."""
+    return any(has_draw(top) for top, _ in definitions.list_sources(node, function))
 
 
 def _counts(assignment: Assignment) -> bool:

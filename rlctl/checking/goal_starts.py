@@ -11,7 +11,7 @@ import numpy as np
 from rlctl.checking.assignments import Assignment, read_key, read_name, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Value
-from rlctl.checking.goal_draws import is_draw
+from rlctl.checking.goal_draws import has_draw, is_draw, is_drawn
 from rlctl.checking.previous_values import is_goal
 from rlctl.checking.source_code import Expression, FaultyCode, Function, walk_own, write_code
 from rlctl.checking.stale_values import FIRST_WORDS
@@ -124,7 +124,7 @@ class GoalStarts:
                 draw = self._find_draw(one)
                 draws: list[ast.AST] = [node for node in ast.walk(draw) if is_draw(node)]
                 is_first = self._is_of_first_reset([one.value]) or self._is_of_first_reset(draws)
-                if is_first and self._draws_inside(one):
+                if is_first and is_drawn(self.definitions, one.value, one.function):
                     yield self._make(one.statement, "only the first reset draws this goal, and later ones keep it")
 
     def _is_of_first_reset(self, nodes: Sequence[ast.AST]) -> bool:
@@ -132,10 +132,6 @@ class GoalStarts:
         numbers = [found.number for node in nodes if (found := self.source.find(node)) is not None]
         times = [any(number in call.values for number in numbers) for call in self.resets]
         return len(times) > 1 and times[0] and not any(times[1:])
-
-    def _draws_inside(self, one: Assignment) -> bool:
-        """Say whether what is assigned is drawn, also in functions that it calls."""
-        return any(self._draws(top) for top, _ in self.definitions.list_sources(one.value, one.function))
 
     def _find_draw(self, one: Assignment) -> ast.expr:
         for node in ast.walk(one.value):
@@ -145,12 +141,9 @@ class GoalStarts:
                     return origin
         return one.value
 
-    def _draws(self, node: ast.AST) -> bool:
-        return any(is_draw(one) for one in ast.walk(node))
-
     def _is_unused(self, one: Assignment, function: Function) -> bool:
         """Say whether a local goal is drawn and never read."""
-        if not isinstance(one.target, ast.Name) or one.element is not None or not self._draws(one.value):
+        if not isinstance(one.target, ast.Name) or one.element is not None or not has_draw(one.value):
             return False
         name = one.target.id
         reads = [node for node in ast.walk(function) if isinstance(node, ast.Name) and node.id == name]
@@ -163,7 +156,7 @@ class GoalStarts:
         parents = self.source.parents
         is_plain = parents[one.statement] is parents[other.statement] and one.statement is not other.statement
         is_plain &= not isinstance(other.statement, ast.AugAssign)
-        if not is_plain or not self._draws(one.value) or one.added or other.added or one.element is not None:
+        if not is_plain or not has_draw(one.value) or one.added or other.added or one.element is not None:
             return False
         first, last = one.statement.end_lineno or 0, other.statement.end_lineno or 0
         between = [node for node in walk_own(function) if first < getattr(node, "lineno", 0) <= last]
@@ -181,7 +174,7 @@ class GoalStarts:
         ]
         if is_read or any(key in self.definitions.list_reads(call, function) for call in calls):
             return False
-        return not isinstance(one.target, ast.Subscript) and not self._draws(other.value)
+        return not isinstance(one.target, ast.Subscript) and not has_draw(other.value)
 
 
 def _read_last(call: NotedCall, number: int) -> Value:

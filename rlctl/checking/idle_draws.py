@@ -12,13 +12,13 @@ from rlctl.checking.definitions import ReadExpression
 from rlctl.checking.episode import Moment
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Value
-from rlctl.checking.goal_draws import is_draw
+from rlctl.checking.goal_draws import has_draw, is_draw, is_drawn
 from rlctl.checking.goal_starts import UNUSED
+from rlctl.checking.hinged_bases import has_engine
 from rlctl.checking.previous_values import is_goal
 from rlctl.checking.source_code import Expression, FaultyCode, Function, write_code
 from rlctl.checking.term_names import split_name
 from rlctl.checking.values import flatten
-from rlctl.environments.simulations import find_mujoco
 
 PHYSICAL_WORDS = {
     "wind", "current", "friction", "mass", "payload", "grip", "drag", "damping", "disturbance", "slope", "inertia",
@@ -71,9 +71,8 @@ class IdleDraws:
             if not backs:
                 continue
             place = function.body.index(backs[-1])
-            before = [
-                one for one in function.body[:place] if self._places(one, function) and self._draws(one, function)
-            ]
+            before = [one for one in function.body[:place] if self._places(one, function)]
+            before = [one for one in before if is_drawn(self.definitions, one, function)]
             after = [one for one in function.body[place + 1 :] if self._places(one, function)]
             if before and not after:
                 what = f"{write_code(backs[-1])} sets back what {write_code(before[-1])} has placed"
@@ -98,10 +97,10 @@ class IdleDraws:
         for function in self._functions:
             for text, several in self.definitions.list_assigned(function).items():
                 one = several[0]
-                if one.is_part or not self._draws(one.statement, function):
+                if one.is_part or not is_drawn(self.definitions, one.statement, function):
                     continue
                 if isinstance(one.target, ast.Name):
-                    is_drawn_here = any(is_draw(node) for node in ast.walk(one.value))
+                    is_drawn_here = has_draw(one.value)
                     is_unread = is_drawn_here and self._is_name_unread(function, text)
                 else:
                     key = read_key(one.target)
@@ -109,11 +108,6 @@ class IdleDraws:
                 if is_unread:
                     what = f"{write_code(one.statement)}: it is drawn, and nothing reads it"
                     yield FaultyCode(one.statement, what, self.source.find_place(one.statement))
-
-    def _draws(self, statement: ast.stmt, function: Function) -> bool:
-        """Say whether a statement has something that is drawn."""
-        tops = self.definitions.list_sources(statement, function)
-        return any(is_draw(node) for top, _ in tops for node in ast.walk(top))
 
     def _is_physical(self, keys: set[str]) -> bool:
         words = {word for key in keys for word in split_name(key)}
@@ -162,8 +156,7 @@ class IdleDraws:
 
     @functools.cached_property
     def _has_engine(self) -> bool:
-        instance = self.noted.instance
-        return find_mujoco(instance.env) is not None or bool(list(instance.find_clients()))
+        return has_engine(self.noted.instance)
 
     def _list_keys(self, draw: Expression) -> set[str]:
         """Return what is set from a draw: names, attributes, and the words of the calls that get it."""

@@ -10,7 +10,7 @@ import numpy as np
 from rlctl.checking.assignments import LIBRARIES, read_key, read_name, read_root, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import Value
-from rlctl.checking.goal_draws import GoalDraws, is_draw
+from rlctl.checking.goal_draws import GoalDraws, is_drawn
 from rlctl.checking.source_code import Expression, FaultyCode, Function
 
 FEWEST = 8  # steps of an episode
@@ -124,7 +124,7 @@ class LateEvents:
             if isinstance(above, ast.If) and node is above.test:
                 return any(self._does_something(part, one.function) for part in above.body)
             if isinstance(above, ast.IfExp) and node is above.test:
-                return self._draws_inside(above.body, one.function)
+                return is_drawn(self.definitions, above.body, one.function)
             if self._is_choice(node):
                 return True
             if not isinstance(above, ast.BoolOp):
@@ -151,9 +151,11 @@ class LateEvents:
         return all(value is not None and bool(np.all(value)) for value in values)
 
     def _does_something(self, statement: ast.stmt, function: Function) -> bool:
+        if is_drawn(self.definitions, statement, function):
+            return True
         tops = [top for top, _ in self.definitions.list_sources(statement, function)]
         nodes = [node for top in tops for node in ast.walk(top)]
-        if any(is_draw(node) or (isinstance(node, ast.Call) and read_name(node.func) in PUSHES) for node in nodes):
+        if any(isinstance(node, ast.Call) and read_name(node.func) in PUSHES for node in nodes):
             return True
         inside = {*ast.walk(statement)}
         return any(
@@ -162,10 +164,6 @@ class LateEvents:
             for one in several
             if one.statement in inside
         )
-
-    def _draws_inside(self, node: ast.expr, function: Function) -> bool:
-        tops = [top for top, _ in self.definitions.list_sources(node, function)]
-        return any(is_draw(inner) for top in tops for inner in ast.walk(top))
 
     def _stands(self, one: Expression) -> bool:
         """Say whether a timer is compared that is the same in all steps of all episodes."""

@@ -9,7 +9,7 @@ import numpy as np
 from rlctl.checking.assignments import Assignment, peel, read_key, read_words
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
 from rlctl.checking.experiments.worlds import judges_resets
-from rlctl.checking.goal_draws import is_draw
+from rlctl.checking.goal_draws import is_drawn
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -64,8 +64,7 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
 
 def _grows(noted: NotedEpisodes, one: Assignment, key: str) -> bool:
     """Say whether an attribute is multiplied by a draw, or gets one added."""
-    tops = noted.definitions.list_sources(one.value, one.function)
-    if not any(is_draw(node) for top, _ in tops for node in ast.walk(top)):
+    if not is_drawn(noted.definitions, one.value, one.function):
         return False
     match one.statement, peel(one.value):
         case ast.AugAssign(), _:
