@@ -53,9 +53,15 @@ def find_other_halves(notes: NotedEpisodes) -> Iterator[tuple[str, str, str, tup
         if not halves or end - begin != 3 or one.function not in notes.of_steps:
             continue
         what = ["linear", "mixed", "mixed", "angular"][begin - halves[0]]
-        called = "angular" if words & ANGULAR else "linear" if words & (LINEAR | OTHER_NAMES) else what
-        if called != what:
+        called = _name_half(words)
+        if called and called != what:
             yield called, what, one.text, one.where
+
+
+def _name_half(words: set[str]) -> str:
+    if words & ANGULAR:
+        return "angular"
+    return "linear" if words & (LINEAR | OTHER_NAMES) else ""
 
 
 def _list_kept(notes: NotedEpisodes, node: ast.expr) -> Sequence[str]:
