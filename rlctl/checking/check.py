@@ -260,7 +260,7 @@ def judge(records: Records, rules: Collection[str] = tuple(RULES)) -> CheckVerdi
 
 def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
     try:
-        findings = _findings(rule, records)
+        findings = _findings(rule, records, {finding.rule for finding in verdict.findings})
     except NotJudged as reason:
         verdict.not_judged[rule] = str(reason)
     except NotApplicable as reason:
@@ -274,14 +274,14 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
         verdict.findings += findings
 
 
-def _findings(rule: str, records: Records) -> list[RuleFinding]:
-    """Return the findings of a rule; those by expressions of the source only where it has found nothing else but infos,
-    and experiments nothing for the rules that find the same."""
+def _findings(rule: str, records: Records, earlier: set[str]) -> list[RuleFinding]:
+    """Return the findings of a rule but those whose mistake is shown by another rule already: by an experiment, or by
+    one of the `earlier` rules; those by expressions of the source only where it has found nothing else but infos."""
     found: set[str] = {finding.rule for finding in records.findings}
     by_expressions: list[RuleFinding] = records.facts.get(BY_EXPRESSIONS, [])
     of_source = [one for one in by_expressions if one.rule == rule and not found & set(one.same)]
     try:
-        played = _find_played(rule, records)
+        played = [one for one in _find_played(rule, records) if not (found | earlier) & set(one.same)]
         return of_source if of_source and all(one.severity is Severity.INFO for one in played) else played
     except (NotJudged, NotApplicable):
         if not of_source:

@@ -97,6 +97,13 @@ def multiply_counts(
     return math.prod(counts)
 
 
+def list_factors_that_stay(
+    factors: Sequence[tuple[ast.expr, int]], constants: Mapping[ast.expr, float], exponent: int = 1
+) -> tuple[float, ...]:
+    """Return the values of the factors with an exponent that never change, whatever they are called."""
+    return tuple(constants[factor] for factor, by in factors if by == exponent and factor in constants)
+
+
 def read_time(node: ast.expr, one: Expression, constants: Mapping[ast.expr, float]) -> float | None:
     """Return the time that a part of an expression is, by what it is called [s]; None for anything else."""
     value = constants.get(node)

@@ -17,6 +17,7 @@ from rlctl.checking.named_times import (
     extend_constants,
     find_constants,
     list_factors,
+    list_factors_that_stay,
     list_summands,
     multiply_counts,
     read_rate,
@@ -55,6 +56,7 @@ class TimedExpression:
     seconds: float  # the time
     most: int  # how often it is evaluated in a step, at most
     where: tuple[str, int]
+    factors: tuple[float, ...] = ()  # what else it is multiplied by, of what never changes
 
     @property
     def total_s(self) -> float:
@@ -64,7 +66,9 @@ class TimedExpression:
     def is_wrong(self, times: StepTimes) -> bool:
         """Say whether it counts a step for too short or too long by the number of its substeps."""
         if self.most == 1:
-            return math.isclose(self.total_s, times.physics_s, rel_tol=EXACT)
+            # The number of substeps may have any name.
+            is_multiplied = any(math.isclose(factor, times.substeps, rel_tol=EXACT) for factor in self.factors)
+            return math.isclose(self.total_s, times.physics_s, rel_tol=EXACT) and not is_multiplied
         too_long = times.control_s * times.substeps
         return self.most == times.substeps and math.isclose(self.total_s, too_long, rel_tol=EXACT)
 
@@ -130,7 +134,8 @@ def _find_added(
                 most = _count(source, one, target, steps) or _count_conditions(source, one, steps)
                 seconds = times[0] * multiply_counts(factors, one, constants)
                 if most:
-                    yield TimedExpression(use, ast.unparse(target), one.text, seconds, most, one.where)
+                    others = list_factors_that_stay(factors, constants)
+                    yield TimedExpression(use, ast.unparse(target), one.text, seconds, most, one.where, others)
 
 
 def _read_sum(source: SourceCode, node: ast.expr) -> tuple[ast.expr, ast.expr] | None:
@@ -207,7 +212,8 @@ def _find_multiplied(
         is_scaled = any(isinstance(node, ast.Constant) and node.value not in FULL_TURN for node, _ in factors)
         if len(times) == 1 and len(counters) == 1 and not is_scaled:
             seconds = times[0] * multiply_counts(factors, one, constants)
-            yield TimedExpression(Use.COUNTED, ast.unparse(counters[0]), one.text, seconds, 1, one.where)
+            others = list_factors_that_stay(factors, constants)
+            yield TimedExpression(Use.COUNTED, ast.unparse(counters[0]), one.text, seconds, 1, one.where, others)
 
 
 def _counts_steps(source: SourceCode, node: ast.expr, steps: Sequence[NotedCall]) -> bool:
@@ -236,7 +242,8 @@ def _find_divided(
         seconds = times[0] / multiply_counts(factors, one, constants)
         for difference in differences:
             if difference is not None and spans_steps(source, difference, steps):
-                yield TimedExpression(Use.DIVIDED, difference.text, one.text, seconds, 1, one.where)
+                others = list_factors_that_stay(factors, constants, -1)
+                yield TimedExpression(Use.DIVIDED, difference.text, one.text, seconds, 1, one.where, others)
                 break
 
 

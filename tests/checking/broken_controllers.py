@@ -39,12 +39,14 @@ class HopperDamps(MujocoHopper):
         return spring - damping * self.data.qvel[6:]
 
 
-class RL824HopperRepels(Repels, HopperDamps): ...
+class RL824HopperRepels(Repels, HopperDamps):
+    rlctl_ignore = {"RL803": "it is pushed until its legs are inside its body"}
 
 
 class RL824HopperShakes(HopperDamps):
     """Its damping has the wrong sign."""
 
+    rlctl_ignore = {"RL803": "it shakes until its legs are inside its body"}
     gains = 30.0, -2.0
 
 
@@ -129,4 +131,5 @@ class Lever(MujocoRobot):
         return abs(self.data.qpos[0]) < 0.05
 
 
-class RL824LeverRepels(Repels, Lever): ...
+class RL824LeverRepels(Repels, Lever):
+    rlctl_ignore = {"RL118": "it is pushed until it spins"}

@@ -287,8 +287,6 @@ class CrawlerTurns(CrawlerLooks):
 
 
 class RL124CrawlerWrongWay(CrawlerTurns):
-    rlctl_ignore = {**CrawlerTurns.rlctl_ignore, "RL310": "contacts are not reset to the last bit"}
-
     def rotation(self):
         return super().rotation().inv()
 

@@ -162,8 +162,7 @@ class RL119CartGyro(GyroInDegrees, Cart):
     rlctl_ignore = {"RL306": "it does not see its heading"}
 
 
-class RL119CrawlerGyro(GyroInDegrees, CrawlerTurns):
-    rlctl_ignore = {**CrawlerTurns.rlctl_ignore, "RL310": "contacts are not reset to the last bit"}
+class RL119CrawlerGyro(GyroInDegrees, CrawlerTurns): ...
 
 
 class RL119PuckGyro(GyroInDegrees, Puck): ...

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from rlctl.checking.differences import COMPARED_STEPS, LATE, find_difference, report
+from rlctl.checking.differences import COMPARED_STEPS, LATE, compare, find_difference, report
 from rlctl.checking.episode import EpisodePlayer
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.search import ActionSearch, judges_searches
@@ -19,7 +19,8 @@ RULE = Rule(
     meaning="""
         After an episode that succeeded, terminated or ran out of time, the same seed and actions give another
         episode, with another reward, success or end. reset leaves something of the ended episode: a success
-        flag, a counter, a goal. A warning if only later steps differ a little.
+        flag, a counter, a goal. A warning if only later steps differ a little, and not after an unfinished
+        episode (RL303).
     """,
     fix="Reset every attribute that step changes when an episode succeeds or ends.",
     shows_one=True,
@@ -67,7 +68,14 @@ def _compare_after_ends(records: Records) -> Iterator[RuleFinding]:
             difference = find_difference(records, again, episode)
             if difference is not None and "raised" not in (again.ended, episode.ended):
                 is_mild = difference.step > LATE and difference.size < FAINT
+                if (is_mild or difference.is_small) and _is_left_by_others(records):
+                    continue
                 ending = "that succeeded" if role == "after success" else f"that ended in {role[6:]}"
                 what = f"played again after an episode {ending}"
                 yield report(RULE, records, difference, what, mild=is_mild)
                 return
+
+
+def _is_left_by_others(records: Records) -> bool:
+    """Say whether an unfinished episode leaves something, too (RL303): a residue then has nothing to do with an end."""
+    return bool(records.role("dirty")) and compare(records, "alone", "dirty") is not None
