@@ -224,8 +224,11 @@ def check_registered(constructor: Callable[..., Any]) -> None:
     import gymnasium
 
     if (task := getattr(constructor, "gymnasium_id", None)) is not None:
+        module, _, name = task.rpartition(":")
         with _explain_unregistered(task):
-            gymnasium.spec(task)
+            if module:
+                importlib.import_module(module)  # where `load` did not find it
+            gymnasium.spec(name)  # which knows no module, unlike `gymnasium.make`
 
 
 @contextlib.contextmanager
@@ -235,7 +238,7 @@ def _explain_unregistered(task: str) -> Iterator[None]:
     try:
         yield
     except gymnasium.error.UnregisteredEnv:
-        name = task.rpartition(":")[2]
+        package, colon, name = task.rpartition(":")
         old = getattr(sys.modules.get("gym"), "envs", None)  # imported, so an id may be registered there
         registry = getattr(old, "registry", {})
         if name in getattr(registry, "env_specs", registry):
@@ -244,7 +247,7 @@ def _explain_unregistered(task: str) -> Iterator[None]:
         if module := own_ids.find_registering_module(task):
             raise _name_module(task, module) from None
         forms = "" if ":" in task else f" If a package registers it, write PACKAGE:{task}."
-        close = did_you_mean(name, gymnasium.registry)
+        close = did_you_mean(task, [f"{package}{colon}{known}" for known in gymnasium.registry])
         raise UsageError(f"Gymnasium has no environment {task!r}.{close}{forms}") from None
     except (gymnasium.error.DeprecatedEnv, ModuleNotFoundError) as error:
         missing = getattr(error.__cause__, "name", None) or getattr(error, "name", None)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
-import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NoReturn
 
@@ -14,8 +12,9 @@ from pydantic import AfterValidator, PlainSerializer
 from rlctl.engine import PYBULLET, Engine
 from rlctl.environments import named_task
 from rlctl.environments.graphics import refuse_windows
+from rlctl.environments.parameters import check_fields, check_keywords, refuse_unexpected
 from rlctl.environments.registry import call_plugin, is_task, load, may_make_environments
-from rlctl.errors import RecipeError, TaskError, check_name, short_repr
+from rlctl.errors import RecipeError, TaskError
 from rlctl.library_output import print_mujoco_warnings
 
 if TYPE_CHECKING:
@@ -234,8 +233,12 @@ class EnvSpec:
             except RecipeError:
                 raise RecipeError(f"{self.task} takes no render_mode") from None
         draw_without_display(only_where_possible=True)  # a constructor may draw, in any render mode
-        with refuse_windows(self.task):
-            env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
+        try:
+            with refuse_windows(self.task):
+                env: gymnasium.Env[Any, Any] = call_plugin(self.task, lambda: constructor(**parameters))
+        except TaskError as error:
+            refuse_unexpected(self.task, constructor, self.parameters, error.__cause__)
+            raise
         asking = "__getattr__ for an attribute that it lacks: "  # which must raise AttributeError
         is_vectorised = call_plugin(self.task, lambda: hasattr(env, "num_envs"), doing=asking)
         if is_vectorised and not isinstance(env, gymnasium.Env):
@@ -305,65 +308,3 @@ PolicySpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.POLICY)), Pla
 """The `EnvSpec` in a policy file; the file may come from somebody else, so its task is checked before the import."""
 EpisodeSpec = Annotated[EnvSpec, AfterValidator(_name_by(named_task.EPISODE)), PlainSerializer(_dump)]
 """The `EnvSpec` in a recorded episode."""
-
-
-def check_given(task: str, constructor: Any, values: Mapping[str, Any]) -> None:
-    """Raise `RecipeError` for parameters that a task or an environment does not have; nothing is built."""
-    if is_task(constructor):
-        check_fields(constructor, values)
-    else:
-        check_keywords(task, constructor, values)
-
-
-def check_keywords(task: str, constructor: Any, parameters: Mapping[str, Any]) -> None:
-    """Raise `RecipeError` if a plain environment's constructor has no parameter of that name."""
-    known = read_parameters(constructor) if parameters else None
-    if known is None or any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
-        return
-    for key in parameters:
-        if key != "max_episode_steps" or not hasattr(constructor, "gymnasium_id"):
-            check_name(key, known, f"task.{key}: {task} has no parameter", RecipeError)
-
-
-def read_parameters(constructor: Any) -> Mapping[str, inspect.Parameter] | None:
-    """Return the parameters of a plain environment's constructor by name; None if they are unknown.
-
-    For a Gymnasium id these are the parameters of its entry point.
-    """
-    if hasattr(constructor, "gymnasium_id"):
-        import gymnasium
-        from gymnasium.envs.registration import load_env_creator
-
-        spec = gymnasium.registry.get(constructor.gymnasium_id.rpartition(":")[2])
-        if spec is None or spec.entry_point is None:
-            return None
-        constructor = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)
-    return inspect.signature(constructor).parameters
-
-
-def check_fields(task: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a `Task`'s parameters, converted to the types of its fields; raises `RecipeError` for a wrong value."""
-    import typing
-
-    import pydantic
-
-    from rlctl.storage import validation
-
-    fields = task.parameters()
-    hints = call_plugin(task.__name__, lambda: typing.get_type_hints(task)) if values else {}
-    checked = {}
-    for key, value in values.items():
-        check_name(key, fields, f"task.{key}: {task.__name__} has no parameter", RecipeError)
-        is_text = hints[key] in (int, float) and isinstance(value, bool | str)
-        if is_text or (isinstance(value, float) and math.isnan(value)):  # pydantic accepts them as numbers
-            raise RecipeError(f"task.{key}: expected a number, got {short_repr(repr(value))}")
-        try:
-            adapter = pydantic.TypeAdapter(hints[key])
-        except pydantic.errors.PydanticUserError:  # a type of the author's own
-            kind = getattr(hints[key], "__name__", hints[key])
-            raise RecipeError(f"task.{key}: a value of type {kind} cannot be given here, only in Python") from None
-        try:
-            checked[key] = adapter.validate_python(value)
-        except pydantic.ValidationError as error:
-            raise RecipeError(validation.explain_invalid(error, adapter, value, f"task.{key}")) from None
-    return checked

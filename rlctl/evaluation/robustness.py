@@ -12,8 +12,9 @@ import numpy as np
 import pydantic
 
 from rlctl.engine import Engine
+from rlctl.environments.parameters import read_parameters
 from rlctl.environments.registry import is_task
-from rlctl.environments.spec import EnvChanges, EnvSpec, read_parameters
+from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import UsageError, check_name, did_you_mean, short_repr
 from rlctl.policy.shipped import Interval
 from rlctl.storage import untrusted

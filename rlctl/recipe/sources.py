@@ -9,7 +9,8 @@ from typing import Any
 
 from rlctl.engine import Engine
 from rlctl.environments import registry
-from rlctl.environments.spec import EnvChanges, check_given, merge
+from rlctl.environments.parameters import check_given
+from rlctl.environments.spec import EnvChanges, merge
 from rlctl.errors import RecipeError, did_you_mean, short_repr
 from rlctl.recipe.hyperparameters import ON_POLICY
 from rlctl.recipe.recipe import WITH_PRIVILEGED, NormalizeSettings, Recipe, Source, validate

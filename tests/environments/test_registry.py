@@ -330,6 +330,33 @@ def test_parameters_that_are_not_there(my_env, write_module):
     )
 
 
+def test_a_parameter_that_only_the_base_class_could_take(write_module):
+    passes = """
+    class Passes(MyEnv):
+        def __init__(self, speed=1.0, **others):
+            super().__init__(**others)
+
+    class Fails(MyEnv):
+        def __init__(self, **others):
+            super().__init__(gian=2)
+
+    gymnasium.register("Passes-v0", entry_point=Passes)
+    """
+    write_module("passes.py", f"{ENV}\n{passes}")
+    unknown = "has no parameter 'gian'. Did you mean 'gain'? It has: speed, gain."
+    assert error(RecipeError, "passes:Passes-v0", {"gian": 1}) == f"task.gian: passes:Passes-v0 {unknown}"
+    assert error(RecipeError, "passes.py:Passes", {"gian": 1}) == f"task.gian: passes.py:Passes {unknown}"
+    assert EnvSpec("passes:Passes-v0", {"gain": 3.0}).make().unwrapped.gain == 3.0
+    assert "unexpected keyword argument" in error(TaskError, "passes.py:Fails", {"gain": 1})
+
+
+def test_an_id_of_a_module_is_checked_before_it_is_built(write_module):
+    write_module("moored.py", f"{ENV}\n    gymnasium.register('Moored-v0', entry_point=MyEnv)\n")
+    registry.check_registered(registry.load("moored:Moored-v0"))
+    with pytest.raises(UsageError, match="Did you mean 'moored:Moored-v0'"):
+        registry.check_registered(registry.load("moored:Mored-v0"))
+
+
 def test_parameters_of_another_type():
     assert error(RecipeError, "reach", {"tolerance": "abc"}) == ("task.tolerance: expected a number, got 'abc'")
 
