@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from rlctl import errors, missing_packages
-from rlctl.entry_points import find_module_file
-from rlctl.environments import installed, own_ids, suggestions
+from rlctl.entry_points import OURS, find_module_file
+from rlctl.environments import installed, own_files, own_ids, suggestions
 from rlctl.environments.graphics import opengl_fix
 from rlctl.environments.mujoco_version import mujoco_fix
 from rlctl.environments.places import describe_exception_place
@@ -27,7 +27,7 @@ from rlctl.storage import files
 
 PRESETS = Path(__file__).parents[1] / "recipe" / "presets"
 """Preset recipes: `--config presets/NAME`."""
-_MOST_NAMED = 4  # classes of a file
+_MOST_NAMED = 4  # classes of a file, or files of a task
 _GYMNASIUM_ID = re.compile(r"^(?!.*\.py:)(?:(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d+|[\w.]+:[\w.-]+/[\w.-]+)$")
 """An id with a version, or one of a module with a namespace, as `metaworld:Meta-World/MT1`: no class has that form."""
 
@@ -138,8 +138,19 @@ def identify_task(task: str) -> dict[str, Any]:
     return {"origin": find_origin(task), "source_sha256": digest}
 
 
+def identify_files(task: str) -> dict[str, str]:
+    """Return the SHA-256 of what a task's file needs besides itself: modules and model files of its package or folder.
+
+    Of rlctl's own tasks nothing: their distribution's version says it.
+    """
+    if find_origin(task).get("distribution") in OURS:
+        return {}
+    return own_files.digest_own_files(_find_hashed_file(task))
+
+
 def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "the run began") -> list[str]:
-    """Describe how a task differs from an earlier result of `identify_task`; empty if it does not."""
+    """Describe how a task differs from an earlier result of `identify_task`, and of `identify_files` as `files_sha256`
+    where it is known; empty if it does not."""
     now = identify_task(task)
     earlier, later = (origin if isinstance(origin, dict) else {} for origin in (before.get("origin"), now["origin"]))
     if earlier != later:
@@ -147,8 +158,13 @@ def describe_task_changes(before: Mapping[str, Any], task: str, since: str = "th
         return ["task {} came from {} when {since}, and comes from {} now".format(task, *names, since=since)]
     if before.get("source_sha256") != now["source_sha256"]:
         file = _find_hashed_file(task)
-        gone = file is not None and not file.is_file()
-        return [f"{file or task} {'no longer exists' if gone else f'has changed since {since}'}"]
+        if file is None:
+            return []  # it is not found from here
+        return [f"{file} {f'has changed since {since}' if file.is_file() else 'no longer exists'}"]
+    if isinstance(needed := before.get("files_sha256"), dict) and needed != (files_now := identify_files(task)):
+        changed = [name for name in sorted({*needed, *files_now}) if needed.get(name) != files_now.get(name)]
+        named = ", ".join(changed[:_MOST_NAMED]) + (" and others" if len(changed) > _MOST_NAMED else "")
+        return [f"{named} of {task} {'has' if len(changed) == 1 else 'have'} changed since {since}"]
     return []
 
 

@@ -6,8 +6,9 @@ import difflib
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rlctl.environments import installed, registry, suggestions
 from rlctl.environments.registry import describe_task_changes
@@ -161,8 +162,8 @@ def _list_warnings(policy: FoundPolicy) -> Iterator[str]:
     if policy.run is not None:
         change = describe_source_change(policy.run)
     elif info is not None and info.provenance is not None:
-        digest = info.provenance.source_sha256
-        change = _describe_source_change(info.spec.task, digest, "this policy was exported")
+        before = {"source_sha256": info.provenance.source_sha256}
+        change = _describe_source_change(info.spec.task, before, "this policy was exported")
     if change:
         yield f"warning: {change}; its score may have changed"
     if policy.run is not None and policy.file == policy.run.best_policy:
@@ -177,16 +178,17 @@ def describe_source_change(run: RunDirectory) -> str | None:
     """Return how the source of a run's task has changed since the run began; None if it has not, or is not known."""
     try:
         status = run.status()
-        task, digest = _locate_source(str(status["task"]), run), status.get("source_sha256")
+        task = _locate_source(str(status["task"]), run)
     except ArtifactError:
         return None
-    return _describe_source_change(task, digest, "the run began")
+    return _describe_source_change(task, status, "the run began")
 
 
-def _describe_source_change(task: str, digest: object, since: str) -> str | None:
+def _describe_source_change(task: str, before: Mapping[str, Any], since: str) -> str | None:
+    if before.get("source_sha256") is None:
+        return None
     # The version of the distribution alone changes nothing.
-    before = {"origin": registry.find_origin(task), "source_sha256": digest}
-    changes = describe_task_changes(before, task, since) if digest is not None else []
+    changes = describe_task_changes({**before, "origin": registry.find_origin(task)}, task, since)
     return changes[0] if changes else None
 
 
@@ -245,7 +247,7 @@ def locate_task(task: str, run: RunDirectory | None) -> str:
 def _locate_source(task: str, run: RunDirectory | None) -> str:
     """Return a task with the absolute path of its file, also if the training named it by a module; imports nothing."""
     folder = _find_training_folder(task, run)
-    if folder is None or run is None:
+    if folder is None or run is None or registry.is_gymnasium_id(task):
         return task
     place, _, name = task.rpartition(":")
     if not place.endswith(".py"):

@@ -9,7 +9,7 @@ import sys
 import uuid
 from typing import TYPE_CHECKING, Any
 
-from rlctl.environments.registry import find_git_commit, identify_task
+from rlctl.environments.registry import find_git_commit, identify_files, identify_task
 from rlctl.errors import DivergedError, Interrupted, RlctlError, RunTaken
 from rlctl.recipe.recipe import Recipe, find_difference
 from rlctl.recipe.sources import resolve_with_stages
@@ -32,6 +32,7 @@ def write_start(run: RunDirectory, start: Start, device: str) -> None:
         "error": None,
         "task": start.task,
         **identify_task(start.task),
+        "files_sha256": identify_files(start.task),
         "callbacks": {name: identify_task(name) for name in recipe.callbacks},
         "algo": recipe.algo,
         "seed": recipe.seed,

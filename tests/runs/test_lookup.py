@@ -271,6 +271,25 @@ def test_looking_for_changes_of_a_source_does_not_change_what_is_imported(tmp_pa
     assert sys.path == before
 
 
+def test_the_file_of_an_id_is_that_of_its_class_from_any_folder(tmp_path, monkeypatch):
+    run = RunDirectory(tmp_path / "project" / "runs" / "Rope-v0" / "2026-01-01_10-00-00_s0")
+    run.path.mkdir(parents=True)
+    package = tmp_path / "project" / "hanging_ropes"
+    package.mkdir()
+    (package / "__init__.py").write_text("import gymnasium\ngymnasium.register('Rope-v0', 'hanging_ropes.rope:Rope')\n")
+    (package / "rope.py").write_text("MODEL = 'rope.xml'\n")
+    (package / "rope.xml").write_text("<mujoco/>")
+    monkeypatch.chdir(tmp_path / "project")
+    task = "hanging_ropes:Rope-v0"
+    identity = {**registry.identify_task(task), "files_sha256": registry.identify_files(task)}
+    run.status_file.write_text(json.dumps({"task": task, "folder": str(tmp_path / "project"), **identity}))
+    assert lookup.describe_source_change(run) is None
+    (package / "rope.xml").write_text("<mujoco model='rope'/>")
+    assert "rope.xml" in lookup.describe_source_change(run)
+    monkeypatch.chdir(tmp_path)
+    assert lookup.describe_source_change(run) is None  # it is not found from here
+
+
 def test_trials_of_a_tuning_are_not_the_latest(root, make_run):
     assert "train one" in error(ArtifactError, find_run, "latest", root)
     make_run("reach/2026-01-02_10-00-00_tune", "2026-01-02_10-00-01_s0", policy=None)
