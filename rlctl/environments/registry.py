@@ -35,7 +35,8 @@ _GYMNASIUM_ID = re.compile(r"^(?!.*\.py:)(?:(?:[\w.]+:)?(?:[\w.-]+/)?[\w.-]+-v\d
 def load(task: str) -> Callable[..., Any]:
     """Import what `task` names: a `Task` class, or anything that returns a Gymnasium environment when called.
 
-    For a task named by path or module the current folder becomes the last entry of `sys.path`.
+    For a task named by path, or by a module that is not installed, the current folder becomes the last entry of
+    `sys.path`.
     """
     if entry := installed.find(task):
         if entry.problem:
@@ -44,11 +45,11 @@ def load(task: str) -> Callable[..., Any]:
     if _GYMNASIUM_ID.match(task):
         package = task.rpartition(":")[0]
         if package and find_module_file(package, in_current_folder=True) is not None:
-            append_to_path(os.getcwd())
+            _append_current_folder(package)
             import_module(task, package)  # separately, so that an exception is reported as one of the import
         return _load_gymnasium(task)
     if ":" in task.rstrip(":"):
-        append_to_path(os.getcwd())
+        _append_current_folder(task.rpartition(":")[0])
         return _load_target(task, task)
     if _is_registered(task):
         return _load_gymnasium(task)  # an id without a version, of a plugin that Gymnasium has loaded
@@ -298,6 +299,13 @@ def import_module(task: str, name: str) -> Any:
         hint = missing_packages.advise_on(name) or suggestions.suggest(task) or installed.explain_hidden_package(name)
         raise UsageError(f"task {task!r}: no module {name!r} is installed or under {os.getcwd()}{hint}")
     return call_plugin(task, lambda: importlib.import_module(name), doing="import failed: ")
+
+
+def _append_current_folder(module: str) -> None:
+    """Append the current folder to `sys.path`, unless an installed module is meant: there the folder of its project,
+    which may have the same name, would be taken for a namespace package."""
+    if module.endswith(".py") or find_module_file(module) is None:
+        append_to_path(os.getcwd())
 
 
 def import_file(task: str, file: Path) -> Any:

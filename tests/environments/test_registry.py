@@ -1,10 +1,13 @@
 """From what the user typed to an environment, and what is said when there is none."""
 
 import hashlib
+import os
 import subprocess
 import sys
 import textwrap
+from importlib.util import spec_from_file_location
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -516,6 +519,19 @@ def test_an_id_that_an_installed_package_registers(write_module, install, monkey
     assert error(UsageError, "CraneReachDense-v4").endswith("write gym_crane:CraneReachDense-v4")
     assert error(UsageError, "CraneReach-v4").endswith("write gym_crane:CraneReach-v4")
     assert "gym_crane" not in error(UsageError, "Lift-v4")
+
+
+def test_an_installed_package_beside_the_folder_of_its_project(tmp_path, monkeypatch):
+    """An editable installation is found by a finder of its own, after the folders of `sys.path`."""
+    package = tmp_path / "mooring" / "mooring"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("def Rope(): pass\n")
+    spec = spec_from_file_location("mooring", package / "__init__.py", submodule_search_locations=[str(package)])
+    finder = SimpleNamespace(find_spec=lambda name, path, target=None: spec if name == "mooring" else None)
+    monkeypatch.setattr("sys.meta_path", [*sys.meta_path, finder])
+    monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry not in ("", os.getcwd())])
+    monkeypatch.chdir(tmp_path)
+    assert registry.load("mooring:Rope").__name__ == "Rope"
 
 
 def test_a_package_that_an_installed_one_hides(write_module):
