@@ -12,7 +12,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_act
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import NotJudged, OutOfTime
-from rlctl.checking.values import flatten, flatten_action
+from rlctl.checking.values import Parts, flatten, flatten_action, list_parts
 from rlctl.environments.leaves import Leaf, name_element, pick
 
 Frame = NDArray[np.float64]
@@ -62,6 +62,7 @@ class Trials:
 
     def __init__(self, instance: Instance) -> None:
         self.instance = instance
+        self.parts: Parts = []
         self._plain: dict[tuple[int, int], list[Frame]] = {}
 
     def require_repeatable(self) -> None:
@@ -123,6 +124,7 @@ class Trials:
         for moment in episode:
             frames.append(_to_frame(moment))
             if moment.step == 0:
+                self.parts = list(list_parts(moment.observation))
                 after_reset()
         if episode.ended == "time":
             raise OutOfTime("time ran out before the last comparison")

@@ -12,7 +12,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import list_names
-from rlctl.checking.values import flatten
+from rlctl.checking.values import Parts, flatten, list_parts, name_numbers
 from rlctl.checking.worlds import Array
 from rlctl.environments.simulations import find_mujoco
 
@@ -24,6 +24,7 @@ class Look:
     """What a call of reset or step returned, and where the simulation was."""
 
     observation: Array
+    parts: Parts
     reward: float
     qpos: Array
 
@@ -41,7 +42,7 @@ def play(
             simulation = find_mujoco(instance.env)
             qpos = simulation[1].qpos.copy() if simulation else np.zeros(0)
             observation = np.nan_to_num(flatten(moment.observation).astype(np.float64))
-            looks.append(Look(observation, _read_reward(moment.reward), qpos))
+            looks.append(Look(observation, list(list_parts(moment.observation)), _read_reward(moment.reward), qpos))
     finally:
         for name, function in quiet.items():
             setattr(calls, name, function)
@@ -75,7 +76,8 @@ def are_equal(plain: Sequence[Look], again: Sequence[Look]) -> bool:
     return pair is not None and len(pair[0]) == len(plain) and np.array_equal(*pair)
 
 
-def name_columns(columns: Sequence[int], size: int) -> str:
-    """Name columns of `pair_rows`, where the observation has `size` numbers."""
-    names = [f"observation[{column}]" for column in columns if column < size]
+def name_columns(columns: Sequence[int], look: Look) -> str:
+    """Name columns of `pair_rows` of such looks."""
+    size = look.observation.size
+    names = [name_numbers(look.parts, column) for column in columns if column < size]
     return list_names([*names, *(["the reward"] if size in columns else [])])

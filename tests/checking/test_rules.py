@@ -13,7 +13,7 @@ import pytest
 
 from rlctl.checking.experiment import index
 from rlctl.checking.rule_index import EXPERIMENTS, PROCESSES, RULES, find_modules, find_needs
-from rlctl.checking.values import find_numbers
+from rlctl.checking.values import find_numbers, name_numbers
 from tests.checking.judging import (
     FOLDER,
     case,
@@ -197,6 +197,19 @@ def test_hindsight_rewards_that_cannot_be_compared_are_the_matter_of_other_rules
 
 def test_a_number_that_is_too_large_for_a_float_is_left_out():
     assert dict(find_numbers({"hash": 10**400, "terms": {"hash": 10**400, "distance": 1}})) == {"terms/distance": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "name"),
+    [
+        (0, 1, "observation['joints'][0]"),
+        (4, 2, "observation['joints'][4:6]"),
+        (6, 3, "observation['goal'][0:3]"),
+        (5, 2, "observation['joints'][5] and observation['goal'][0]"),
+    ],
+)
+def test_numbers_of_an_observation_are_named_by_their_array(first, count, name):
+    assert name_numbers([("observation['joints']", 6), ("observation['goal']", 3)], first, count) == name
 
 
 @pytest.mark.slow
