@@ -73,6 +73,9 @@ class Cart(Base):
         return (self.x, float(total), bool(self.fast), False, {"first": first})
 
 
+Wagon = Cart  # an older name for the same class
+
+
 def play(env, steps=30):
     source = SourceCode(env)
     calls = []
