@@ -15,6 +15,8 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Literal
 
+import gymnasium
+
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
 from rlctl.checking.rule import NotJudged
@@ -363,8 +365,11 @@ class Context:
 
 
 def _accepts(env: Any, name: str) -> bool:
+    """Say whether reset takes an argument: a library's wrappers do, and pass it on to an environment that may not."""
     try:
         parameters = inspect.signature(env.reset).parameters.values()
     except ValueError:  # not written in Python
         return True
-    return any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    accepts = any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    passes_on = isinstance(env, gymnasium.Wrapper) and type(env).reset.__module__.startswith(("gymnasium.", "rlctl."))
+    return accepts and (not passes_on or _accepts(env.env, name))

@@ -195,6 +195,13 @@ def test_hindsight_rewards_that_cannot_be_compared_are_the_matter_of_other_rules
     }
 
 
+def test_wrappers_take_a_seed_for_an_environment_that_takes_none():
+    """Gymnasium's pass it on. What that raises is RL202's only, and no failure of the picture."""
+    rules = "RL202", "RL203", "RL207", "RL215"
+    assert found("broken_envs.py:no_seed_in_a_wrapper", *rules) == {("RL202", "error")}
+    assert found("broken_envs.py:seed_of_a_wrapper", *rules) == set()
+
+
 def test_a_number_that_is_too_large_for_a_float_is_left_out():
     assert dict(find_numbers({"hash": 10**400, "terms": {"hash": 10**400, "distance": 1}})) == {"terms/distance": 1.0}
 
