@@ -132,11 +132,18 @@ class Trials:
             raise NotJudged("step does not return observation, reward and flags (RL201)")
         return frames
 
-    def has_same_effect(self, dimension: ActionNumber, one: Any, two: Any) -> bool:
-        """Say whether two values of a number of the action, in all steps, lead to the same, but for its own copies."""
+    def has_same_effect(self, dimension: ActionNumber, one: Any, two: Any, before: Any = None) -> bool:
+        """Say whether two values of a number of the action lead to the same, but for its own copies: in all steps, or
+        in the second half of them after another value."""
         copies = self.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
-        played = ([self.with_values(*stage, {dimension: value}) for value in (one, two)] for stage in STAGES)
+        played = ([self._hold(*stage, dimension, value, before) for value in (one, two)] for stage in STAGES)
         return not any(observations_differ(a, b, copies) for a, b in played)
+
+    def _hold(self, seed: int, steps: int, dimension: ActionNumber, value: Any, before: Any) -> list[Frame]:
+        first = 0 if before is None else steps // 2
+        values = [before] * first + [value] * (steps - first)
+        chosen = zip(self.actions(seed, steps), values, strict=True)
+        return self.play(seed, [self.change(action, {dimension: one}) for action, one in chosen])
 
     def copies(self, dimension: ActionNumber, seed: int, steps: int, longest_delay: int) -> list[int]:
         """Return the columns of a frame that only repeat this number of an earlier action."""

@@ -159,6 +159,18 @@ class RL701Switch(Clean):
         super().move(np.array([action[0], np.sign(action[1])], np.float32))
 
 
+class Valves(Clean):
+    """Actions open and close two valves, which are closed at first."""
+
+    def start(self):
+        super().start()
+        self.openings = np.zeros(2, np.float32)
+
+    def move(self, action):
+        self.openings = np.clip(self.openings + 0.1 * action, 0.0, 1.0)
+        super().move(0.5 - self.openings)
+
+
 class GrasperFarAway(RL701Switch):
     """It closes only where there is something, and that is far away."""
 

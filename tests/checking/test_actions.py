@@ -28,7 +28,7 @@ CASES += [
     for robot in ("Rover", "Drone", "Arm", "Crawler")
     for twin in (f"broken_maps.py:RL707{robot}Switches",)
 ]
-CLEAN = [f"{FILE}:RL701Switch"]
+CLEAN = [f"{FILE}:RL701Switch", f"{FILE}:Valves"]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
