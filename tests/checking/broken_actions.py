@@ -17,6 +17,13 @@ class RL701DeadAction(OneAxis):
         super().move(action * np.array([1, 0], np.float32))
 
 
+class DeadActionOfGlobalDraws(RL701DeadAction):
+    """Its start is another one after each reset, whatever the seed: the dead action shows all the same."""
+
+    def start(self):
+        self.position = np.random.uniform(-1, 1, 2).astype(np.float32)  # noqa: NPY002
+
+
 class RL701NoAction(Clean):
     """A point that drifts, whatever is done."""
 

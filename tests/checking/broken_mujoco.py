@@ -285,6 +285,12 @@ class ArmOldTipAtRandom(RL815ArmOldTip):
         self.data.qpos[0] += 0.01 * np.random.default_rng().standard_normal()
 
 
+class ArmOldTipOfGlobalDraws(RL815ArmOldTip):
+    def start(self):
+        super().start()
+        self.data.qpos[0] += 0.01 * np.random.standard_normal()  # noqa: NPY002
+
+
 class RL815ArmOldSensor(RL815ArmOldTip):
     def tip(self):
         return self.data.sensordata[:3]

@@ -53,6 +53,11 @@ def the_finding(name, rule):
     return finding
 
 
+def test_global_draws_hide_no_dead_action():
+    task = f"{FILE}:DeadActionOfGlobalDraws"
+    assert found(task, "RL301", "RL309", "RL701") == {("RL301", "error"), ("RL309", "warning"), ("RL701", "warning")}
+
+
 def test_dead_actions_are_named():
     finding = the_finding("RL701DeadAction", "RL701")
     assert finding.message == (

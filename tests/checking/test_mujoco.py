@@ -115,6 +115,7 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
         ("RL810ArmDrivesRangesInDegrees", "RL810", ("turn is [-50, 120], in degrees (likewise lift, bend)",)),
         ("RL812HopperOtherSoles", "RL812", ("geom left_thigh",)),
         ("RL815ArmOldTip", "RL815", ("site_xpos of tip", "one substep old")),
+        ("ArmOldTipOfGlobalDraws", "RL815", ("site_xpos of tip", "one substep old")),
         ("ArmOldTipInParts", "RL815", ("observation['goal'][0] (site_xpos of tip)", "observation['goal'][2]")),
         ("RL815ArmResetsWithoutForward", "RL815", ("of reset", "before mj_forward")),
         ("RL815HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),

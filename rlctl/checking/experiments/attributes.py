@@ -90,7 +90,7 @@ def find_log_without_engine(records: Records) -> AttributeLog | None:
     return log if log is not None and not np.isfinite(log.physics_s) else None
 
 
-@experiment("attributes", PROBE, 107, share=0.2)
+@experiment("attributes", PROBE, 107, share=0.2, seeds_globals=True)
 def log_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play a few short episodes and read the attributes that change after each step."""
     instance = context.instance

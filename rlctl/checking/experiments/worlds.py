@@ -152,7 +152,7 @@ judges_logs = JudgeHook[LoggedWorld]()
 _HOOKS = (judges_models, judges_worlds, judges_resets, judges_trials, judges_logs)
 
 
-@experiment("worlds", INSTANCES, 20, share=4.0, hooks=_HOOKS)
+@experiment("worlds", INSTANCES, 20, share=4.0, hooks=_HOOKS, seeds_globals=True)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
     if not ENGINES & sys.modules.keys():
