@@ -1,5 +1,7 @@
 """Environments whose actions do nothing, too little or too much; and twins that only look so."""
 
+import collections
+
 import numpy as np
 from broken_envs import Clean
 from gymnasium import spaces
@@ -176,6 +178,25 @@ class Valves(Clean):
     def move(self, action):
         self.openings = np.clip(self.openings + 0.1 * action, 0.0, 1.0)
         super().move(0.5 - self.openings)
+
+
+class WaitsAndKeepsATrace(Clean):
+    """Each action acts four steps later, and a trace of the last episode is observed: the reward is not late."""
+
+    last = np.zeros(2, np.float32)
+
+    def start(self):
+        super().start()
+        self.trace = np.float32(1e-5) * self.last
+        self.waiting = collections.deque([np.zeros(2, np.float32)] * 4)
+
+    def move(self, action):
+        self.waiting.append(action.astype(np.float32))
+        super().move(self.waiting.popleft())
+        self.last = self.position.copy()
+
+    def observe(self):
+        return self.position + self.trace
 
 
 class GrasperFarAway(RL701Switch):

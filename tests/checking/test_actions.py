@@ -58,6 +58,10 @@ def test_global_draws_hide_no_dead_action():
     assert found(task, "RL301", "RL309", "RL701") == {("RL301", "error"), ("RL309", "warning"), ("RL701", "warning")}
 
 
+def test_what_differs_before_an_action_is_no_answer_to_it():
+    assert found(f"{FILE}:WaitsAndKeepsATrace", "RL636") == set()
+
+
 def test_dead_actions_are_named():
     finding = the_finding("RL701DeadAction", "RL701")
     assert finding.message == (
