@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,9 +30,14 @@ class Look:
 
 
 def play(
-    instance: Instance, calls: MujocoCalls, steps: int = STEPS, seed: int = FIRST_SEED, **hooks: Any
+    instance: Instance,
+    calls: MujocoCalls,
+    steps: int = STEPS,
+    seed: int = FIRST_SEED,
+    after_look: Callable[[], None] = lambda: None,
+    **hooks: Any,
 ) -> list[Look]:
-    """Play an episode with some functions of `calls` replaced."""
+    """Play an episode with some functions of `calls` replaced; `after_look` is called after reset and each step."""
     quiet = {field.name: field.default for field in dataclasses.fields(MujocoCalls) if field.name.startswith("after")}
     for name, function in (quiet | hooks).items():
         setattr(calls, name, function)
@@ -43,6 +48,7 @@ def play(
             qpos = simulation[1].qpos.copy() if simulation else np.zeros(0)
             observation = np.nan_to_num(flatten(moment.observation).astype(np.float64))
             looks.append(Look(observation, list(list_parts(moment.observation)), _read_reward(moment.reward), qpos))
+            after_look()
     finally:
         for name, function in quiet.items():
             setattr(calls, name, function)

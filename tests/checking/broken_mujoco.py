@@ -279,6 +279,18 @@ class ArmOldTipInParts(RL815ArmOldTip):
         return self.split(observation), *rest
 
 
+class ArmOldTipSteers(RL815ArmOldTip):
+    """Its controller reads where the tip is, too."""
+
+    def targets(self, action):
+        return super().targets(action) + 0.1 * (self.goal - self.tip())
+
+
+class ArmSteers(MujocoArm):
+    def targets(self, action):
+        return super().targets(action) + 0.1 * (self.goal - self.tip())
+
+
 class ArmOldTipAtRandom(RL815ArmOldTip):
     def start(self):
         super().start()

@@ -145,10 +145,8 @@ def _judge_trials(trials: MujocoTrials) -> Iterator[RuleFinding]:
 
 
 def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
-    refreshing = RefreshAfterSteps()
-    changed = play(instance, calls, after_step=refreshing, as_stepped=refreshing.as_stepped)
-    pair = pair_rows(plain, changed)
-    if pair is None or len(pair[0]) < FEWEST_TRIAL_LOOKS:
+    pair = _pair_refreshed(instance, calls, plain)
+    if pair is None:
         return
     old, new = (part[1:] for part in pair)  # a reset has no step
     off, moves = np.abs(new - old).max(axis=0), np.abs(np.diff(new, axis=0)).max(axis=0)
@@ -166,6 +164,22 @@ def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -
     evidence |= {"value": float(old[step, worst]), "expected": float(new[step, worst])}
     severity = Severity.WARNING if (off[columns] > TINY * moves[columns]).any() else Severity.INFO
     yield RuleFinding(RULE, message, evidence, severity, fix=FORWARD)
+
+
+def _pair_refreshed(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> tuple[Array, Array] | None:
+    """Return what an episode observes, and what it would with all up to date after each step; None for too few rows."""
+    refreshing = RefreshAfterSteps()
+    hooks = {"after_step": refreshing, "as_stepped": refreshing.as_stepped}
+    pair = pair_rows(plain, play(instance, calls, **hooks))
+    if pair is not None and len(pair[0]) >= FEWEST_TRIAL_LOOKS:
+        return pair
+    # A controller reads it too, and moves the robot otherwise: it gets what it had. A reward may compare both.
+    hooks |= {"after_forward": refreshing.forget, "after_reset": refreshing.forget, "after_look": refreshing.restore}
+    pair = pair_rows(plain, play(instance, calls, **hooks))
+    if pair is None or len(pair[0]) < FEWEST_TRIAL_LOOKS:
+        return None
+    pair[1][:, -1] = pair[0][:, -1]
+    return pair
 
 
 def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
