@@ -12,7 +12,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_act
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import NotJudged, OutOfTime
-from rlctl.checking.values import Parts, flatten, flatten_action, list_parts
+from rlctl.checking.values import ArrayNames, flatten, flatten_action, list_parts
 from rlctl.environments.leaves import Leaf, name_element, pick
 
 Frame = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Trials:
 
     def __init__(self, instance: Instance) -> None:
         self.instance = instance
-        self.parts: Parts = []
+        self.parts: ArrayNames = []
         self._plain: dict[tuple[int, int], list[Frame]] = {}
 
     def require_repeatable(self) -> None:

@@ -12,7 +12,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import list_names
-from rlctl.checking.values import Parts, flatten, list_parts, name_numbers
+from rlctl.checking.values import ArrayNames, flatten, list_parts, name_numbers
 from rlctl.checking.worlds import Array
 from rlctl.environments.simulations import find_mujoco
 
@@ -24,7 +24,7 @@ class Look:
     """What a call of reset or step returned, and where the simulation was."""
 
     observation: Array
-    parts: Parts
+    parts: ArrayNames
     reward: float
     qpos: Array
 

@@ -20,7 +20,7 @@ from rlctl.environments.bullet_calls import LIBRARIES, is_library
 from rlctl.environments.leaves import Leaf, pick
 
 NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
-Parts = Sequence[tuple[str, int]]
+ArrayNames = Sequence[tuple[str, int]]
 """The name and the size of each array of a flat observation."""
 
 
@@ -55,7 +55,7 @@ def list_parts(observation: Any, name: str = "observation") -> Iterator[tuple[st
         yield name, flatten(observation).size
 
 
-def name_numbers(parts: Parts, first: int, count: int = 1) -> str:
+def name_numbers(parts: ArrayNames, first: int, count: int = 1) -> str:
     """Return how to write numbers of a flat observation that follow each other: `observation[3]`, or
     `observation['velocity'][0:3]`."""
     names = []

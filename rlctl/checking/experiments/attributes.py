@@ -25,8 +25,8 @@ from rlctl.checking.term_weights import find_action_terms, find_weighed_terms
 from rlctl.checking.transitions import flatten_floats, list_float_parts
 from rlctl.checking.values import (
     NUMBERS,
+    ArrayNames,
     Attribute,
-    Parts,
     find_author,
     find_numbers,
     flatten_action,
@@ -60,7 +60,7 @@ class AttributeLog:
     names: list[str]  # of the numbers that change: `self.velocity[0]`
     values: Numbers  # Shape (looks, names)
     observed: Numbers  # The numbers that are floats. Shape (looks, elements)
-    parts: Parts  # of what is observed
+    parts: ArrayNames  # of what is observed
     actions: Numbers  # Shape (looks, numbers); 0 at a reset
     rewards: Numbers  # Shape (looks,); NaN at a reset, and where it is no number
     infos: Mapping[str, Numbers]  # numbers of info by name. Shape (looks,) each; NaN where there is none

@@ -19,7 +19,7 @@ from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import Turn, list_world_turns
-from rlctl.checking.values import Parts, name_numbers
+from rlctl.checking.values import ArrayNames, name_numbers
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
 RULE = Rule(
@@ -97,7 +97,7 @@ def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:
 
 
 def _find_directions(
-    parts: Parts, observed: Array, episodes: NDArray[np.int_], turns: Sequence[Turn]
+    parts: ArrayNames, observed: Array, episodes: NDArray[np.int_], turns: Sequence[Turn]
 ) -> Iterator[RuleFinding]:
     """Yield the first direction that is fixed in the world, turned the wrong way."""
     for column, turn in find_turned_directions(observed, episodes, turns):
@@ -153,7 +153,7 @@ def _turn(name: str, values: Array, quaternions: Array, *, is_own: bool) -> _Vec
     return _Vectors(name, [values, inside, level], [outside, twice])
 
 
-def _find_in_observation(parts: Parts, observed: Array, vectors: _Vectors) -> Iterator[RuleFinding]:
+def _find_in_observation(parts: ArrayNames, observed: Array, vectors: _Vectors) -> Iterator[RuleFinding]:
     size = vectors.wrong[0].shape[1]
     for column in range(observed.shape[1] - size + 1):
         block = observed[:, column : column + size]
