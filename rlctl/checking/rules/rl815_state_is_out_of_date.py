@@ -169,7 +169,7 @@ def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -
 def _pair_refreshed(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> tuple[Array, Array] | None:
     """Return what an episode observes, and what it would with all up to date after each step; None for too few rows."""
     refreshing = RefreshAfterSteps()
-    hooks = {"after_step": refreshing, "as_stepped": refreshing.as_stepped}
+    hooks: dict[str, Any] = {"after_step": refreshing, "as_stepped": refreshing.as_stepped}
     pair = pair_rows(plain, play(instance, calls, **hooks))
     if pair is not None and len(pair[0]) >= FEWEST_TRIAL_LOOKS:
         return pair
