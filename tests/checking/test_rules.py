@@ -195,6 +195,11 @@ def test_hindsight_rewards_that_cannot_be_compared_are_the_matter_of_other_rules
     }
 
 
+def test_of_asymmetric_actions_the_worst_is_named():
+    (finding,) = findings("broken_spaces.py:MoreAndMoreAsymmetric", "RL106")
+    assert finding.message == "2 of 2 actions are not symmetric: action[1] is in [-0.1, 1]"
+
+
 def test_wrappers_take_a_seed_for_an_environment_that_takes_none():
     """Gymnasium's pass it on. What that raises is RL202's only, and no failure of the picture."""
     rules = "RL202", "RL203", "RL207", "RL215"
