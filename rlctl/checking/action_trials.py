@@ -12,7 +12,7 @@ from rlctl.checking.episode import EpisodePlayer, Moment, build_action, draw_act
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import NotJudged, OutOfTime
-from rlctl.checking.values import flatten, flatten_action
+from rlctl.checking.values import ArrayNames, flatten, flatten_action, list_parts
 from rlctl.environments.leaves import Leaf, name_element, pick
 
 Frame = NDArray[np.float64]
@@ -62,6 +62,7 @@ class Trials:
 
     def __init__(self, instance: Instance) -> None:
         self.instance = instance
+        self.parts: ArrayNames = []
         self._plain: dict[tuple[int, int], list[Frame]] = {}
 
     def require_repeatable(self) -> None:
@@ -123,6 +124,7 @@ class Trials:
         for moment in episode:
             frames.append(_to_frame(moment))
             if moment.step == 0:
+                self.parts = list(list_parts(moment.observation))
                 after_reset()
         if episode.ended == "time":
             raise OutOfTime("time ran out before the last comparison")
@@ -130,11 +132,18 @@ class Trials:
             raise NotJudged("step does not return observation, reward and flags (RL201)")
         return frames
 
-    def has_same_effect(self, dimension: ActionNumber, one: Any, two: Any) -> bool:
-        """Say whether two values of a number of the action, in all steps, lead to the same, but for its own copies."""
+    def has_same_effect(self, dimension: ActionNumber, one: Any, two: Any, before: Any = None) -> bool:
+        """Say whether two values of a number of the action lead to the same, but for its own copies: in all steps, or
+        in the second half of them after another value."""
         copies = self.copies(dimension, FIRST_SEED, REPEATED_STEPS, LONGEST_DELAY)
-        played = ([self.with_values(*stage, {dimension: value}) for value in (one, two)] for stage in STAGES)
+        played = ([self._hold(*stage, dimension, value, before) for value in (one, two)] for stage in STAGES)
         return not any(observations_differ(a, b, copies) for a, b in played)
+
+    def _hold(self, seed: int, steps: int, dimension: ActionNumber, value: Any, before: Any) -> list[Frame]:
+        first = 0 if before is None else steps // 2
+        values = [before] * first + [value] * (steps - first)
+        chosen = zip(self.actions(seed, steps), values, strict=True)
+        return self.play(seed, [self.change(action, {dimension: one}) for action, one in chosen])
 
     def copies(self, dimension: ActionNumber, seed: int, steps: int, longest_delay: int) -> list[int]:
         """Return the columns of a frame that only repeat this number of an earlier action."""

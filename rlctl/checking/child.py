@@ -2,11 +2,13 @@
 
 import dataclasses
 import functools
+import random
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 
+import numpy as np
 from gymnasium import spaces
 
 from rlctl.checking.experiment import Experiment, import_experiments
@@ -101,6 +103,8 @@ def _grow_further(context: Context, known: float) -> float:
 def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
     started = time.monotonic()
     context.progress.phase(experiment.name)
+    context.seeds_globals = experiment.seeds_globals
+    generators = random.getstate(), np.random.get_state()  # noqa: NPY002 (the environment's own draws)
     is_complete, crash = True, ""
     with_finding: set[str] = set()
     try:
@@ -124,5 +128,8 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
             yield describe_failure(EnvironmentRaised("reading an attribute", error), context.progress)
         else:
             crash = traceback.format_exc()
+    if experiment.seeds_globals:  # what follows is to find no seeded generators
+        random.setstate(generators[0])
+        np.random.set_state(generators[1])  # noqa: NPY002
     seconds, is_cut = time.monotonic() - started, context.budget.was_cut
     yield Finished(experiment.name, seconds, is_complete, is_cut, crash, needed_s=context.needed_s)

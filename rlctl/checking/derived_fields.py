@@ -54,6 +54,16 @@ class RefreshAfterSteps:
         mujoco.mj_sensorPos(model, data)
         mujoco.mj_sensorVel(model, data)
 
+    def forget(self, *_: Any) -> None:
+        """Keep no longer what a step left: the environment has computed it again."""
+        self._old = {}
+
+    def restore(self) -> None:
+        """Put back what the last step left, for a controller that reads it in the next one."""
+        for name, array in self._old.items():
+            getattr(self._data, name)[:] = array
+        self.forget()
+
     @contextlib.contextmanager
     def as_stepped(self) -> Iterator[None]:
         """See `MujocoCalls`."""

@@ -37,6 +37,7 @@ class Experiment:
     run: RunExperiment  # yields findings at once, so that a crash loses none
     own_rules: tuple[str, ...]
     hooks: tuple[JudgeHook[Any], ...]
+    seeds_globals: bool = False  # see `Context.seeds_globals`
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -87,12 +88,21 @@ class JudgeHook(Generic[Shown]):
 
 
 def experiment(
-    name: str, process: str, place: int, *rules: Rule, share: float = 1.0, hooks: tuple[JudgeHook[Any], ...] = ()
+    name: str,
+    process: str,
+    place: int,
+    *rules: Rule,
+    share: float = 1.0,
+    hooks: tuple[JudgeHook[Any], ...] = (),
+    seeds_globals: bool = False,
 ) -> Callable[[RunExperiment], Experiment]:
-    """Make an experiment of a function. If it completes it decides `rules`, and those that register with its hooks."""
+    """Make an experiment of a function. If it completes it decides `rules`, and those that register with its hooks.
+
+    With `seeds_globals` it compares episodes also of an environment that draws from global generators (RL309).
+    """
 
     def make(run: RunExperiment) -> Experiment:
-        return Experiment(name, process, place, share, run, tuple(rule.id for rule in rules), hooks)
+        return Experiment(name, process, place, share, run, tuple(rule.id for rule in rules), hooks, seeds_globals)
 
     return make
 

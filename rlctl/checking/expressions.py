@@ -93,19 +93,19 @@ def record_expressions(source: SourceCode) -> Iterator[ExpressionRecorder]:
         codes |= {
             (file, code.co_name, code.co_firstlineno): code for code in _list_codes(compile(noting, file, "exec"))
         }
-    replaced: list[tuple[FunctionType, CodeType]] = []
+    replaced: dict[FunctionType, CodeType] = {}  # a class with two names in a module has each function twice
     setattr(builtins, NOTE, recorder.note)
     try:
         for module in source.modules:
             for function in _list_functions(module):
                 old = function.__code__
                 new = codes.get((str(module.__file__), old.co_name, old.co_firstlineno))
-                if new is not None and new.co_freevars == old.co_freevars:
-                    replaced.append((function, old))
+                if new is not None and new.co_freevars == old.co_freevars and function not in replaced:
+                    replaced[function] = old
                     function.__code__ = new
         yield recorder
     finally:
-        for function, old in replaced:
+        for function, old in replaced.items():
             function.__code__ = old
         delattr(builtins, NOTE)
 

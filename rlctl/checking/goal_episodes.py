@@ -11,8 +11,8 @@ from rlctl.checking.episode import EpisodePlayer, Moment
 from rlctl.checking.instance import Instance
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.snapshots import Beginnings
-from rlctl.checking.transitions import flatten_floats
-from rlctl.checking.values import read_flag
+from rlctl.checking.transitions import flatten_floats, list_float_parts
+from rlctl.checking.values import name_numbers, read_flag
 from rlctl.checking.workspaces import find_chains
 from rlctl.environments.success import SUCCESS
 
@@ -54,6 +54,10 @@ class GoalTrials:
     def goals(self) -> Numbers:
         """The drawn goals. Shape (n, size)."""
         return np.array(list(self.drawn.goals.values()))
+
+    def name_elements(self, first: int, count: int = 1) -> str:
+        """Return how to write elements of the observation that follow each other."""
+        return name_numbers(list_float_parts(self.instance.leaves), first, count)
 
     @property
     def range(self) -> Numbers:

@@ -7,6 +7,7 @@ import functools
 import inspect
 import linecache
 import math
+import random
 import re
 import sys
 import traceback
@@ -14,6 +15,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Literal
+
+import gymnasium
+import numpy as np
 
 from rlctl.checking.progress import CallProgress, read_clock
 from rlctl.checking.records import CallFailure
@@ -279,6 +283,9 @@ class Instance:
         self.resets += 1
         self.progress.episode(episode, seed)
         keywords = {"seed": seed} if self.accepts_seed else {}
+        if self.context.seeds_globals:
+            random.seed(seed)
+            np.random.seed(seed)  # noqa: NPY002 (the environment's own draws)
         return self.call("reset", self.env.reset, **keywords)
 
     def close(self) -> list[CallFailure]:
@@ -306,6 +313,9 @@ class Context:
         self.longest_episode: int | None = None  # of the whole episodes [steps]; None before there are any
         self.reached_limit = False  # whether one of them was truncated
         self.generators: dict[str, str] | None = None  # State of each after the first watched reset; None before
+        self.seeds_globals = False
+        """Whether a reset seeds `numpy.random` and `random`, too. An environment that draws from them plays another
+        episode after each reset, which is RL301 and RL309; other rules can judge it all the same."""
         self.connected: set[int] = set()
         """The clients of PyBullet that instances connected when they were built. Those that do not close them, or are
         not closed, leave their worlds beside those of the kept instance."""
@@ -363,8 +373,11 @@ class Context:
 
 
 def _accepts(env: Any, name: str) -> bool:
+    """Say whether reset takes an argument: a library's wrappers do, and pass it on to an environment that may not."""
     try:
         parameters = inspect.signature(env.reset).parameters.values()
     except ValueError:  # not written in Python
         return True
-    return any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    accepts = any(parameter.name == name or parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    passes_on = isinstance(env, gymnasium.Wrapper) and type(env).reset.__module__.startswith(("gymnasium.", "rlctl."))
+    return accepts and (not passes_on or _accepts(env.env, name))

@@ -29,6 +29,8 @@ LASTING_WORDS = {
     "success", "successes", "total", "viewer", "window", "wins",
 }  # fmt: skip
 """What is meant to last longer than an episode."""
+DRAWING = {"changeVisualShape", "addUserDebugLine", "addUserDebugText", "removeUserDebugItem", "render", "print"}
+ACTING = ast.Assign | ast.AugAssign | ast.AnnAssign | ast.NamedExpr | ast.Delete | ast.Return | ast.Raise | ast.Break
 FORCED_FROM, FORCED_STEPS = 2, 5
 MOST_TRIED = 6
 
@@ -126,7 +128,18 @@ class LeftOvers:
 
     def _is_never_read(self, key: str) -> bool:
         reads = [one for one in self.source.expressions if read_key(one.node) == key and one.function in self._steps]
-        return not reads
+        return all(self._only_draws(one.node) for one in reads)
+
+    def _only_draws(self, read: ast.AST) -> bool:
+        """Say whether a value decides only what is drawn, as the colour of a robot that has hit something."""
+        node, parent = read, self.source.parents[read]
+        while isinstance(parent, ast.expr):
+            node, parent = parent, self.source.parents[parent]
+        if not isinstance(parent, ast.If) or node is not parent.test:
+            return False
+        inside = [inner for one in (*parent.body, *parent.orelse) for inner in ast.walk(one)]
+        calls = {read_name(inner.func) for inner in inside if isinstance(inner, ast.Call)}
+        return calls <= DRAWING and not any(isinstance(inner, ACTING) for inner in inside)
 
     def _try(self, key: str, assignment: Assignment, branch: Branch) -> FaultyCode | None:
         number, episode = 0, self.noted.episodes[0]
@@ -153,7 +166,8 @@ def _read_first(call: NotedCall, number: int) -> Value:
 
 
 def _show(value: Value) -> str:
-    return np.array2string(np.asarray(value), precision=3)
+    numbers = np.asarray(value)
+    return np.array2string(numbers, precision=3) if numbers.ndim else f"{float(numbers):.4g}"
 
 
 def _list_calls(function: Function) -> set[str]:

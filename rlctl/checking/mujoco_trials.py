@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from rlctl.checking.instance import Instance
 from rlctl.checking.mujoco_calls import MujocoCalls
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import list_names
-from rlctl.checking.values import flatten
+from rlctl.checking.values import ArrayNames, flatten, list_parts, name_numbers
 from rlctl.checking.worlds import Array
 from rlctl.environments.simulations import find_mujoco
 
@@ -24,14 +24,20 @@ class Look:
     """What a call of reset or step returned, and where the simulation was."""
 
     observation: Array
+    parts: ArrayNames
     reward: float
     qpos: Array
 
 
 def play(
-    instance: Instance, calls: MujocoCalls, steps: int = STEPS, seed: int = FIRST_SEED, **hooks: Any
+    instance: Instance,
+    calls: MujocoCalls,
+    steps: int = STEPS,
+    seed: int = FIRST_SEED,
+    after_look: Callable[[], None] = lambda: None,
+    **hooks: Any,
 ) -> list[Look]:
-    """Play an episode with some functions of `calls` replaced."""
+    """Play an episode with some functions of `calls` replaced; `after_look` is called after reset and each step."""
     quiet = {field.name: field.default for field in dataclasses.fields(MujocoCalls) if field.name.startswith("after")}
     for name, function in (quiet | hooks).items():
         setattr(calls, name, function)
@@ -41,7 +47,8 @@ def play(
             simulation = find_mujoco(instance.env)
             qpos = simulation[1].qpos.copy() if simulation else np.zeros(0)
             observation = np.nan_to_num(flatten(moment.observation).astype(np.float64))
-            looks.append(Look(observation, _read_reward(moment.reward), qpos))
+            looks.append(Look(observation, list(list_parts(moment.observation)), _read_reward(moment.reward), qpos))
+            after_look()
     finally:
         for name, function in quiet.items():
             setattr(calls, name, function)
@@ -75,7 +82,8 @@ def are_equal(plain: Sequence[Look], again: Sequence[Look]) -> bool:
     return pair is not None and len(pair[0]) == len(plain) and np.array_equal(*pair)
 
 
-def name_columns(columns: Sequence[int], size: int) -> str:
-    """Name columns of `pair_rows`, where the observation has `size` numbers."""
-    names = [f"observation[{column}]" for column in columns if column < size]
+def name_columns(columns: Sequence[int], look: Look) -> str:
+    """Name columns of `pair_rows` of such looks."""
+    size = look.observation.size
+    names = [name_numbers(look.parts, column) for column in columns if column < size]
     return list_names([*names, *(["the reward"] if size in columns else [])])

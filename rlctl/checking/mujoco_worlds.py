@@ -94,7 +94,7 @@ def read_world(model: Any) -> World:
     """Return the bodies of a model: one for each tree of MuJoCo's bodies, and the world itself."""
     roots = [body for body in range(1, model.nbody) if int(model.body_parentid[body]) == 0]
     bodies = sorted((_body(model, root) for root in roots), key=lambda body: (not body.joints, not body.is_free))
-    world = WorldBody(0, "the world", ("",), (), is_free=False, has_heavy_links=False)
+    world = WorldBody(0, "what is fixed to the world", ("",), (), is_free=False, has_heavy_links=False)
     motors = [_motor(model, actuator) for actuator in range(model.nu)]
     known = tuple(motor for motor in motors if motor is not None)  # others drive tendons and sites
     return World(0, (*bodies[:MOST_BODIES], world), "MuJoCo", known)

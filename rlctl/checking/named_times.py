@@ -116,18 +116,22 @@ def read_rate(node: ast.expr, constants: Mapping[ast.expr, float]) -> float | No
     return 1 / value if value is not None and value > 1 and _words(node) & RATE_WORDS else None
 
 
-def is_named_time(node: ast.expr, one: Expression) -> bool:
-    """Say whether names say that a part of an expression is a time: `dt`, `dt / substeps`, `1 / 240`, `1 / rate_hz`."""
+def is_named_time(node: ast.expr, one: Expression, resolved: frozenset[str] = frozenset()) -> bool:
+    """Say whether names say that a part of an expression is a time: `dt`, `dt / substeps`, `1 / 240`, `1 / rate_hz`.
+
+    `resolved` are the names whose values are being read: `speed = speed / 5` is assigned from itself.
+    """
     match node:
         case ast.BinOp(left=ast.Constant(), op=ast.Div(), right=right):
             return bool(_words(right) & RATE_WORDS) or isinstance(right, ast.Constant)
         case ast.BinOp(left=left, op=ast.Div(), right=right):
-            return is_named_time(left, one) and is_count(right, one)
+            return is_named_time(left, one, resolved) and is_count(right, one)
         case ast.BinOp(left=left, op=ast.Mult(), right=right):
-            return any(is_named_time(a, one) and is_count(b, one) for a, b in ((left, right), (right, left)))
-        case ast.Name(id=name):
+            pairs = (left, right), (right, left)
+            return any(is_named_time(time, one, resolved) and is_count(count, one) for time, count in pairs)
+        case ast.Name(id=name) if name not in resolved:
             assigned = list_values(one.function, name)
-            if len(assigned) == 1 and is_named_time(assigned[0], one):
+            if len(assigned) == 1 and is_named_time(assigned[0], one, resolved | {name}):
                 return True
     words = _words(node)
     return bool(words & TIME_WORDS) or words >= {"time", "step"}

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rlctl.checking.records import FIRST_SEED, CheckedEpisode, Records
 from rlctl.checking.rule import NotJudged
-from rlctl.environments.leaves import Leaf, name_element, pick
+from rlctl.environments.leaves import Leaf, name_element, name_leaf, pick
 from rlctl.environments.success import SUCCESS
 
 ROLES = ("episodes", "seeds", "starts", "search")  # each plays other states; the other roles repeat an episode
@@ -57,6 +57,11 @@ def name_floats(leaves: Sequence[Leaf]) -> list[str]:
         for index in find_float_leaves(leaves)
         for flat in range(int(np.prod(leaves[index].shape)))
     ]
+
+
+def list_float_parts(leaves: Sequence[Leaf]) -> list[tuple[str, int]]:
+    """Return the name and the size of each array of these numbers."""
+    return [(name_leaf(leaves[index]), int(np.prod(leaves[index].shape))) for index in find_float_leaves(leaves)]
 
 
 def flatten_floats(leaves: Sequence[Leaf], observation: Any) -> NDArray[np.float64]:

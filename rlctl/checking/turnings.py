@@ -44,6 +44,14 @@ class Turning:
     episodes: Sequence[TurnedEpisode]  # at each angle
 
     @property
+    def common(self) -> list[TurnedEpisode]:
+        """The episodes up to the step at which the first of them ends, as where a turned robot is at its goal."""
+        return [
+            TurnedEpisode(one.headings[: self.steps], one.observed[: self.steps], one.rewards[: self.steps])
+            for one in self.episodes
+        ]
+
+    @property
     def is_explained(self) -> bool:
         """Whether there are steps, and each element is of one of the kinds."""
         return self.steps > 0 and bool((self.stays | self.turns | self.doubles | self.shows).all())

@@ -20,6 +20,8 @@ from rlctl.environments.bullet_calls import LIBRARIES, is_library
 from rlctl.environments.leaves import Leaf, pick
 
 NUMBERS = (bool, int, float, np.bool_, np.integer, np.floating)
+ArrayNames = Sequence[tuple[str, int]]
+"""The name and the size of each array of a flat observation."""
 
 
 def flatten_action(leaves: list[Leaf], action: Any) -> NDArray[np.float64]:
@@ -51,6 +53,18 @@ def list_parts(observation: Any, name: str = "observation") -> Iterator[tuple[st
             yield from list_parts(value, f"{name}[{number}]")
     else:
         yield name, flatten(observation).size
+
+
+def name_numbers(parts: ArrayNames, first: int, count: int = 1) -> str:
+    """Return how to write numbers of a flat observation that follow each other: `observation[3]`, or
+    `observation['velocity'][0:3]`."""
+    names = []
+    for name, size in parts:
+        begin, end = max(first, 0), min(first + count, size)
+        if begin < end:
+            names.append(f"{name}[{begin}]" if end == begin + 1 else f"{name}[{begin}:{end}]")
+        first -= size
+    return " and ".join(names)
 
 
 def find_numbers(info: dict[Any, Any]) -> Iterator[tuple[str, float]]:

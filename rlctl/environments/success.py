@@ -8,7 +8,7 @@ import numpy as np
 SUCCESS = "is_success"
 """The name of success in `info`, as Stable-Baselines3 has it."""
 OTHER_SUCCESS = "success"
-"""The name that Adroit, Meta-World, robosuite and gym-hil use. It counts where `is_success` is missing."""
+"""The name that Adroit, Meta-World and robosuite use. It counts where `is_success` is missing."""
 
 
 def find_success(info: Mapping[str, Any]) -> Any:

@@ -1,5 +1,7 @@
 """Environments whose actions do nothing, too little or too much; and twins that only look so."""
 
+import collections
+
 import numpy as np
 from broken_envs import Clean
 from gymnasium import spaces
@@ -15,6 +17,13 @@ class OneAxis(Clean):
 class RL701DeadAction(OneAxis):
     def move(self, action):
         super().move(action * np.array([1, 0], np.float32))
+
+
+class DeadActionOfGlobalDraws(RL701DeadAction):
+    """Its start is another one after each reset, whatever the seed: the dead action shows all the same."""
+
+    def start(self):
+        self.position = np.random.uniform(-1, 1, 2).astype(np.float32)  # noqa: NPY002
 
 
 class RL701NoAction(Clean):
@@ -157,6 +166,37 @@ class RL701Switch(Clean):
 
     def move(self, action):
         super().move(np.array([action[0], np.sign(action[1])], np.float32))
+
+
+class Valves(Clean):
+    """Actions open and close two valves, which are closed at first."""
+
+    def start(self):
+        super().start()
+        self.openings = np.zeros(2, np.float32)
+
+    def move(self, action):
+        self.openings = np.clip(self.openings + 0.1 * action, 0.0, 1.0)
+        super().move(0.5 - self.openings)
+
+
+class WaitsAndKeepsATrace(Clean):
+    """Each action acts four steps later, and a trace of the last episode is observed: the reward is not late."""
+
+    last = np.zeros(2, np.float32)
+
+    def start(self):
+        super().start()
+        self.trace = np.float32(1e-5) * self.last
+        self.waiting = collections.deque([np.zeros(2, np.float32)] * 4)
+
+    def move(self, action):
+        self.waiting.append(action.astype(np.float32))
+        super().move(self.waiting.popleft())
+        self.last = self.position.copy()
+
+    def observe(self):
+        return self.position + self.trace
 
 
 class GrasperFarAway(RL701Switch):

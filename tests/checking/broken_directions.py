@@ -181,6 +181,14 @@ class RL129TugEast(TugAhead):
         return self.velocity[0]
 
 
+class TugEndsInTheEast(RL129TugEast):
+    """How long its episode is depends on how its world is turned."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, bool(self.velocity[0] > 0.2), truncated, info
+
+
 class RL115TugOldView(Tug):
     """It observes the oldest of four looks."""
 

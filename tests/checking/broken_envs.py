@@ -184,6 +184,29 @@ class RL202NoSeed(Clean):
         return Clean.reset(self)
 
 
+class PromisesPictures(RL202NoSeed):
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+
+
+class SeedsItself(gymnasium.Wrapper):
+    """It needs no seed of what it wraps."""
+
+    def reset(self, *, seed=None, options=None):
+        self.unwrapped.np_random, _ = gymnasium.utils.seeding.np_random(seed)
+        return self.env.reset()
+
+
+def no_seed_in_a_wrapper(render_mode=None):
+    return gymnasium.wrappers.TimeLimit(PromisesPictures(render_mode), 50)
+
+
+def seed_of_a_wrapper():
+    return SeedsItself(RL202NoSeed())
+
+
 class RL203NoOptions(Clean):
     def reset(self, *, seed=None):
         return Clean.reset(self, seed=seed)

@@ -4,6 +4,7 @@ import re
 
 import mujoco
 import numpy as np
+from gymnasium import spaces
 from mujoco_robots import ARM, HOPPER, SIDES, MujocoArm, MujocoHopper
 from scipy.spatial.transform import Rotation
 
@@ -258,10 +259,48 @@ class RL815ArmOldTip(MujocoArm):
         mujoco.mj_step(self.model, self.data, nstep=5)
 
 
+class ArmOldTipInParts(RL815ArmOldTip):
+    """It observes a dictionary, whose own order is not that of its space."""
+
+    def __init__(self):
+        super().__init__()
+        parts = {"goal": 3, "joints": 6}.items()
+        self.observation_space = spaces.Dict({n: spaces.Box(-np.inf, np.inf, (size,), np.float32) for n, size in parts})
+
+    def split(self, observation):
+        return {"joints": observation[:6], "goal": observation[6:]}
+
+    def reset(self, *, seed=None, options=None):
+        observation, info = super().reset(seed=seed)
+        return self.split(observation), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return self.split(observation), *rest
+
+
+class ArmOldTipSteers(RL815ArmOldTip):
+    """Its controller reads where the tip is, too."""
+
+    def targets(self, action):
+        return super().targets(action) + 0.1 * (self.goal - self.tip())
+
+
+class ArmSteers(MujocoArm):
+    def targets(self, action):
+        return super().targets(action) + 0.1 * (self.goal - self.tip())
+
+
 class ArmOldTipAtRandom(RL815ArmOldTip):
     def start(self):
         super().start()
         self.data.qpos[0] += 0.01 * np.random.default_rng().standard_normal()
+
+
+class ArmOldTipOfGlobalDraws(RL815ArmOldTip):
+    def start(self):
+        super().start()
+        self.data.qpos[0] += 0.01 * np.random.standard_normal()  # noqa: NPY002
 
 
 class RL815ArmOldSensor(RL815ArmOldTip):

@@ -266,6 +266,13 @@ class RL609SuccessMisnamed(Clean):
         return {"goal_reached": bool(np.linalg.norm(self.position) < 0.1)}
 
 
+class Succeeds(Clean):
+    """The name of gym-hil, whose numbers no tool takes for a success."""
+
+    def info(self):
+        return {"succeed": bool(np.linalg.norm(self.position) < 0.1)}
+
+
 class RL609SuccessOtherwiseNamed(Clean):
     """The name and the numbers of Adroit and Meta-World count too."""
 

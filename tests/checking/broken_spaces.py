@@ -14,6 +14,12 @@ class RL106Asymmetric(Clean):
         super().move(np.clip(action, self.action_space.low, self.action_space.high))
 
 
+class MoreAndMoreAsymmetric(RL106Asymmetric):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(np.float32([-0.8, -0.1]), np.float32([1.0, 1.0]))
+
+
 class RL106Thrust(RL106Asymmetric):
     def __init__(self):
         super().__init__()

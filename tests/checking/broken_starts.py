@@ -52,6 +52,36 @@ class RL644BoatTowsWithATautRope(BoatTows):
         self.hooked = False
 
 
+class BoatLightsUp(Boat):
+    """Its lamp is on near the middle, and stays so after a reset: that is only seen."""
+
+    def __init__(self):
+        self.is_lit = False
+        super().__init__()
+
+    def render(self): ...
+
+    def shine(self):
+        if self.is_lit:
+            self.render()
+
+    def power(self):
+        return 1.0
+
+    def move(self, action):
+        super().move(self.power() * action)
+        self.shine()
+        if np.linalg.norm(self.place) < 0.002:
+            self.is_lit = True
+
+
+class BoatSlowsDown(BoatLightsUp):
+    """Its lamp takes the power of its motor."""
+
+    def power(self):
+        return 0.9 if self.is_lit else 1.0
+
+
 class BoatToItsAim(Boat):
     """It goes to a target near the shore."""
 

@@ -28,7 +28,7 @@ CASES += [
     for robot in ("Rover", "Drone", "Arm", "Crawler")
     for twin in (f"broken_maps.py:RL707{robot}Switches",)
 ]
-CLEAN = [f"{FILE}:RL701Switch"]
+CLEAN = [f"{FILE}:RL701Switch", f"{FILE}:Valves"]
 
 
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
@@ -51,6 +51,15 @@ def test_clean_is_clean(task):
 def the_finding(name, rule):
     (finding,) = findings(f"{FILE}:{name}", rule)
     return finding
+
+
+def test_global_draws_hide_no_dead_action():
+    task = f"{FILE}:DeadActionOfGlobalDraws"
+    assert found(task, "RL301", "RL309", "RL701") == {("RL301", "error"), ("RL309", "warning"), ("RL701", "warning")}
+
+
+def test_what_differs_before_an_action_is_no_answer_to_it():
+    assert found(f"{FILE}:WaitsAndKeepsATrace", "RL636") == set()
 
 
 def test_dead_actions_are_named():

@@ -39,3 +39,8 @@ def test_finds_the_mistake_and_only_that(case):
 @pytest.mark.slow
 def test_a_robot_that_observes_its_heading_may_look_along_the_axes_of_the_world():
     assert found("broken_directions.py:TugWithACompass", "RL129") == set()
+
+
+@pytest.mark.slow
+def test_episodes_that_end_at_other_steps_in_a_turned_world_are_compared_up_to_there():
+    assert found("broken_directions.py:TugEndsInTheEast", "RL129") == {("RL129", "warning")}

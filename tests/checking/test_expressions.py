@@ -73,6 +73,9 @@ class Cart(Base):
         return (self.x, float(total), bool(self.fast), False, {"first": first})
 
 
+Wagon = Cart  # an older name for the same class
+
+
 def play(env, steps=30):
     source = SourceCode(env)
     calls = []
@@ -189,6 +192,11 @@ class Deep(gymnasium.Env):
 
     def step(self, action):
         return self.x, float(SUM), False, False, {}
+
+    def move(self, speed, dt=0.1):
+        speed = speed / 5
+        self.x = self.x + speed / 2 * dt
+        return self.x[0]
 """
 
 
@@ -198,3 +206,9 @@ def test_a_source_that_is_nested_too_deeply_is_not_judged(tmp_path):
     reasons = {message.reason for message in messages if isinstance(message, Skipped)}
     assert reasons == {TOO_DEEP}
     assert [message.crash for message in messages if isinstance(message, Finished)] == ["", ""]
+
+
+def test_a_name_that_is_assigned_from_itself_is_read(tmp_path):
+    (tmp_path / "slow.py").write_text(DEEP.replace("SUM", "self.move(action[0])"))
+    messages = list(run_here(PROBE, f"{tmp_path}/slow.py:Deep", ["build", "expressions"], 10.0))
+    assert TOO_DEEP not in {message.reason for message in messages if isinstance(message, Skipped)}

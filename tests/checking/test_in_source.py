@@ -125,6 +125,7 @@ SHOWN = {
     "broken_starts.py": {
         "RL644BoatTowsFromTheStart": ("RL644", "BoatTows"),
         "RL644BoatTowsWithATautRope": ("RL644", "BoatTows"),
+        "BoatSlowsDown": ("RL644", "BoatLightsUp"),
         "RL610BoatFloatsAtItsAim": ("RL610", "BoatToItsAim"),
         "RL306BoatToOneAim": ("RL306", "BoatToItsAim"),
         "RL306BoatOfOneGenerator": ("RL306", "BoatToItsAim"),
@@ -166,7 +167,7 @@ SOUND = {
     "broken_parts.py": ["BoatStartsItsEngine", "BoatBrakes", "BoatSaturates"],
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
-    "broken_starts.py": ["HopperOfFriction"],
+    "broken_starts.py": ["HopperOfFriction", "BoatLightsUp"],
     "broken_success.py": ["BoatIsPaidForItsRest"],
     "broken_unwrapped.py": ["ValveHasStops"],
 }

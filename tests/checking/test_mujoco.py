@@ -115,6 +115,9 @@ def test_a_part_that_must_not_touch_is_no_wrong_part(name):
         ("RL810ArmDrivesRangesInDegrees", "RL810", ("turn is [-50, 120], in degrees (likewise lift, bend)",)),
         ("RL812HopperOtherSoles", "RL812", ("geom left_thigh",)),
         ("RL815ArmOldTip", "RL815", ("site_xpos of tip", "one substep old")),
+        ("ArmOldTipOfGlobalDraws", "RL815", ("site_xpos of tip", "one substep old")),
+        ("ArmOldTipSteers", "RL815", ("site_xpos of tip", "one substep old")),
+        ("ArmOldTipInParts", "RL815", ("observation['goal'][0] (site_xpos of tip)", "observation['goal'][2]")),
         ("RL815ArmResetsWithoutForward", "RL815", ("of reset", "before mj_forward")),
         ("RL815HopperStateInTheLoop", "RL815", ("observation[0] (position of body)",)),
         ("RL816ArmBeyondRange", "RL816", ("only", "of the action's range")),
@@ -157,6 +160,11 @@ def test_rules_that_compare_repeated_episodes_say_why_they_could_not():
     verdict = judge(records_of("broken_mujoco.py:ArmOldTipAtRandom", "build", "worlds"), ["RL815"])
     assert verdict.judged == []
     assert verdict.not_judged == {"RL815": "an episode with the same seed and actions is not the same again (RL302)"}
+
+
+@pytest.mark.slow
+def test_a_controller_may_read_where_the_tip_is():
+    assert found("broken_mujoco.py:ArmSteers", "RL815") == set()
 
 
 @pytest.mark.slow

@@ -94,6 +94,13 @@ def finding_of(name):
     return finding
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "key"), [("RL609SuccessMisnamed", "goal_reached"), ("Succeeds", "succeed")])
+def test_what_is_probably_meant_as_success_is_named(name, key):
+    (finding,) = findings(f"{BROKEN}:{name}", "RL609")
+    assert f"'{key}' in info is not used" in finding.message
+
+
 def test_worth_is_discounted():
     # 1 + 0.99 * 2 + 0.9801 * 3 = 5.9203; -(1 + 0.99 + 0.9801) = -2.9701
     assert discounted_sum(np.array([1.0, 2.0, 3.0])) == pytest.approx(5.9203)

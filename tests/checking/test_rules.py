@@ -13,7 +13,7 @@ import pytest
 
 from rlctl.checking.experiment import index
 from rlctl.checking.rule_index import EXPERIMENTS, PROCESSES, RULES, find_modules, find_needs
-from rlctl.checking.values import find_numbers
+from rlctl.checking.values import find_numbers, name_numbers
 from tests.checking.judging import (
     FOLDER,
     case,
@@ -195,8 +195,33 @@ def test_hindsight_rewards_that_cannot_be_compared_are_the_matter_of_other_rules
     }
 
 
+def test_of_asymmetric_actions_the_worst_is_named():
+    (finding,) = findings("broken_spaces.py:MoreAndMoreAsymmetric", "RL106")
+    assert finding.message == "2 of 2 actions are not symmetric: action[1] is in [-0.1, 1]"
+
+
+def test_wrappers_take_a_seed_for_an_environment_that_takes_none():
+    """Gymnasium's pass it on. What that raises is RL202's only, and no failure of the picture."""
+    rules = "RL202", "RL203", "RL207", "RL215"
+    assert found("broken_envs.py:no_seed_in_a_wrapper", *rules) == {("RL202", "error")}
+    assert found("broken_envs.py:seed_of_a_wrapper", *rules) == set()
+
+
 def test_a_number_that_is_too_large_for_a_float_is_left_out():
     assert dict(find_numbers({"hash": 10**400, "terms": {"hash": 10**400, "distance": 1}})) == {"terms/distance": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "name"),
+    [
+        (0, 1, "observation['joints'][0]"),
+        (4, 2, "observation['joints'][4:6]"),
+        (6, 3, "observation['goal'][0:3]"),
+        (5, 2, "observation['joints'][5] and observation['goal'][0]"),
+    ],
+)
+def test_numbers_of_an_observation_are_named_by_their_array(first, count, name):
+    assert name_numbers([("observation['joints']", 6), ("observation['goal']", 3)], first, count) == name
 
 
 @pytest.mark.slow

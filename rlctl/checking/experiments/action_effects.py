@@ -44,7 +44,7 @@ judges_actions = JudgeHook[ActionTrials]()
 """Shows trials, with which the parts play episodes."""
 
 
-@experiment("action effects", INSTANCES, 60, share=4.0, hooks=(judges_actions,))
+@experiment("action effects", INSTANCES, 60, share=4.0, hooks=(judges_actions,), seeds_globals=True)
 def compare_actions(context: Context) -> Iterator[ChildMessage]:
     """Play the same episode with each number of the action at other values."""
     with context.fresh() as instance:

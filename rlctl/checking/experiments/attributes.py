@@ -22,9 +22,10 @@ from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Records
 from rlctl.checking.rule import NotJudged
 from rlctl.checking.term_names import is_about_steps, is_paid
 from rlctl.checking.term_weights import find_action_terms, find_weighed_terms
-from rlctl.checking.transitions import flatten_floats
+from rlctl.checking.transitions import flatten_floats, list_float_parts
 from rlctl.checking.values import (
     NUMBERS,
+    ArrayNames,
     Attribute,
     find_author,
     find_numbers,
@@ -59,6 +60,7 @@ class AttributeLog:
     names: list[str]  # of the numbers that change: `self.velocity[0]`
     values: Numbers  # Shape (looks, names)
     observed: Numbers  # The numbers that are floats. Shape (looks, elements)
+    parts: ArrayNames  # of what is observed
     actions: Numbers  # Shape (looks, numbers); 0 at a reset
     rewards: Numbers  # Shape (looks,); NaN at a reset, and where it is no number
     infos: Mapping[str, Numbers]  # numbers of info by name. Shape (looks,) each; NaN where there is none
@@ -88,7 +90,7 @@ def find_log_without_engine(records: Records) -> AttributeLog | None:
     return log if log is not None and not np.isfinite(log.physics_s) else None
 
 
-@experiment("attributes", PROBE, 107, share=0.2)
+@experiment("attributes", PROBE, 107, share=0.2, seeds_globals=True)
 def log_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play a few short episodes and read the attributes that change after each step."""
     instance = context.instance
@@ -231,6 +233,7 @@ def _join(instance: Instance, clients: Sequence[int], looks: list[_LoggedLook]) 
         names=names[:MOST_NUMBERS],
         values=np.nan_to_num(values),
         observed=np.nan_to_num(np.stack([look.observed for look in looks]).astype(np.float64)),
+        parts=list_float_parts(instance.leaves),
         actions=np.stack([np.resize(look.action, width) if look.action.size else np.zeros(width) for look in looks]),
         rewards=np.array([look.reward for look in looks]),
         infos={name: np.array([look.infos.get(name, np.nan) for look in looks]) for name in info_names},

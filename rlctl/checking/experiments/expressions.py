@@ -231,7 +231,7 @@ def _play_all(instance: Instance, recorder: ExpressionRecorder) -> list[list[Not
     return episodes
 
 
-@experiment("expressions", INSTANCES, 35, share=3.0, hooks=(judges_expressions,))
+@experiment("expressions", INSTANCES, 35, share=3.0, hooks=(judges_expressions,), seeds_globals=True)
 def note_expressions(context: Context) -> Iterator[ChildMessage]:
     """Show what was noted to all judges."""
     with noted_episodes(context) as noted:

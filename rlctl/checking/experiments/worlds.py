@@ -22,6 +22,7 @@ from rlctl.checking.mujoco_worlds import MujocoStateReader
 from rlctl.checking.readings import join_logs
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Shortened, Skipped
 from rlctl.checking.rule import NotApplicable, NotJudged, RuleFinding
+from rlctl.checking.values import name_numbers
 from rlctl.checking.world_logs import LoggedWorld, WorldLog, WorldLogger
 from rlctl.checking.worlds import VELOCITY, Array
 from rlctl.environments.bullet_calls import BulletCalls, record_calls
@@ -51,12 +52,11 @@ class ObservedWorld:
 
     def name_element(self, column: int) -> str:
         """Return how to write an element of the observation: `observation[3]`, or `observation['velocity'][0]`."""
-        first = 0
-        for name, size in self.logs[0].parts:
-            if column < first + size:
-                return f"{name}[{column - first}]"
-            first += size
-        return f"observation[{column}]"
+        return self.name_elements(column)
+
+    def name_elements(self, first: int, count: int = 1) -> str:
+        """Return how to write elements of the observation that follow each other."""
+        return name_numbers(self.logs[0].parts, first, count)
 
     @property
     def sizes(self) -> list[int]:
@@ -152,7 +152,7 @@ judges_logs = JudgeHook[LoggedWorld]()
 _HOOKS = (judges_models, judges_worlds, judges_resets, judges_trials, judges_logs)
 
 
-@experiment("worlds", INSTANCES, 20, share=4.0, hooks=_HOOKS)
+@experiment("worlds", INSTANCES, 20, share=4.0, hooks=_HOOKS, seeds_globals=True)
 def watch_worlds(context: Context) -> Iterator[ChildMessage]:
     """Log the worlds of an instance through a few episodes, then let them fall alone, which may change them."""
     if not ENGINES & sys.modules.keys():

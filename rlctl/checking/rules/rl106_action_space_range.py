@@ -49,7 +49,7 @@ def _unusual_actions(leaf: Leaf) -> Iterator[RuleFinding]:
         ((low != -1) | (high != 1), Severity.INFO, "are not in [-1, 1]"),
     ):
         if wrong.any():
-            i = int(wrong.argmax())
+            i = int(np.where(wrong, off, -1.0).argmax())  # the farthest off
             message = f"{int(wrong.sum())} of {wrong.size} actions {what}: action[{i}] is in [{low[i]:g}, {high[i]:g}]"
             evidence = {"element": f"action[{i}]", "value": [float(low[i]), float(high[i])], "expected": [-1.0, 1.0]}
             yield RuleFinding(RULE, message, evidence, severity)

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from rlctl.checking import attitudes
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
+from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.quaternion_orders import QuaternionOrders
 from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.rule import Rule, RuleFinding, Severity
-from rlctl.checking.world_logs import LoggedWorld, WorldLog
+from rlctl.checking.world_logs import WorldLog
 from rlctl.checking.worlds import ANGULAR, JOINTS, ORIENTATION, VELOCITY, Array, Link, World
 
 RULE = Rule(
@@ -63,23 +63,24 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     found = False
     for one in watched.observed:
-        for finding in _find_misread_quaternions(one.world, one.logs, one.observed):
+        for finding in _find_misread_quaternions(one):
             found = True
             yield finding
     # The yaw of an object that lies on something may be constant, where it is read in a wrong order.
     for one in watched.thrown if not found else ():
-        yield from _find_misread_quaternions(one.world, one.logs, one.observed)
+        yield from _find_misread_quaternions(one)
 
 
-def _find_misread_quaternions(world: LoggedWorld, logs: Sequence[WorldLog], observed: Array) -> Iterator[RuleFinding]:
+def _find_misread_quaternions(one: ObservedWorld) -> Iterator[RuleFinding]:
     """Yield an element of the observation that follows from a quaternion in a wrong order, and from no right one."""
+    world, logs, observed = one.world.world, one.logs, one.observed
     moving = np.flatnonzero(_find_moved(observed).sum(axis=0) >= FEWEST_MOVED)
     looks = [poses for log in logs for poses in log.poses]
     links = sorted(set.intersection(*(set(poses) for poses in looks)))
     quaternions = {link: np.array([poses[link][ORIENTATION] for poses in looks]) for link in links}
     velocities = _find_velocities(logs)
     wrong: list[Match] = []
-    orders = ORDERS[world.world.engine]
+    orders = ORDERS[world.engine]
     for (link, values), (places, order) in itertools.product(quaternions.items(), orders.items()):
         names, features = _compute_all(values[:, places], velocities)
         features[:, _find_moved(features).sum(axis=0) < FEWEST_MOVED] = np.nan
@@ -95,7 +96,7 @@ def _find_misread_quaternions(world: LoggedWorld, logs: Sequence[WorldLog], obse
     known = {column for column, _ in signs} | _find_turned(observed, {entry[0] for entry in wrong}, quaternions, logs)
     for column, link, order, feature, _ in sorted(wrong, key=lambda entry: entry[0]):
         if column not in known:
-            yield _misread(world.world, f"observation[{column}]", names[feature], link, order)
+            yield _misread(world, one.name_element(column), names[feature], link, order)
             return
     matches = set(wrong)
     for column, link, order, feature, sign in sorted(wrong, key=lambda entry: entry[0]):
@@ -103,11 +104,11 @@ def _find_misread_quaternions(world: LoggedWorld, logs: Sequence[WorldLog], obse
         for other in () if is_right else next((angles for angles in attitudes.ANGLES if feature in angles), ()):
             if other != feature and (column + 1, link, order, other, sign) in matches:
                 what = f"{names[feature]} and {names[other]}"
-                yield _misread(world.world, f"observation[{column}:{column + 2}]", what, link, order)
+                yield _misread(world, one.name_elements(column, 2), what, link, order)
                 return
     columns = sorted({column for column, *_ in wrong})
     rows = [column for column in range(observed.shape[1] - 2) if sum(column + i in columns for i in range(3)) >= 2]
-    yield from _find_misread_axes(world.world, observed, rows, quaternions)
+    yield from _find_misread_axes(one, rows, quaternions)
 
 
 def _drop_lonely_components(matches: Sequence[Match]) -> list[Match]:
@@ -157,20 +158,21 @@ def _misread(world: World, element: str, what: str, link: Link, order: str) -> R
 
 
 def _find_misread_axes(
-    world: World, observed: Array, columns: Sequence[int], quaternions: Mapping[Link, Array]
+    one: ObservedWorld, columns: Sequence[int], quaternions: Mapping[Link, Array]
 ) -> Iterator[RuleFinding]:
     """Yield three elements that are an axis of a wrong rotation and of no right one: each element alone is, up to its
     sign, in the right matrix too."""
+    world = one.world.world
     right = np.hstack([_find_axes(values) for values in quaternions.values()]) if columns else np.zeros(0)
     for column in columns:
-        values = observed[:, None, column : column + 3]
+        values = one.observed[:, None, column : column + 3]
         if _equal_axes(values, right).any():
             continue
         for (link, quaternion), (places, order) in itertools.product(quaternions.items(), ORDERS[world.engine].items()):
             is_same = _equal_axes(values, _find_axes(quaternion[:, places]))
             if is_same.any():
                 what = AXIS_NAMES[int(is_same.argmax())]
-                yield _misread(world, f"observation[{column}:{column + 3}]", what, link, order)
+                yield _misread(world, one.name_elements(column, 3), what, link, order)
                 return
 
 

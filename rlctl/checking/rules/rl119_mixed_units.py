@@ -12,10 +12,11 @@ from rlctl.checking.experiments.attributes import AttributeLog
 from rlctl.checking.experiments.goals import SCALED_GOAL, ScaledGoal
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.rates import Rate, find_rates
-from rlctl.checking.records import Records
+from rlctl.checking.records import Built, Records
 from rlctl.checking.rule import NotApplicable, Rule, RuleFinding, Severity, list_others
 from rlctl.checking.step_times import find_rates as find_attribute_rates
-from rlctl.checking.transitions import collect_transitions, name_floats
+from rlctl.checking.transitions import collect_transitions, list_float_parts, name_floats
+from rlctl.checking.values import name_numbers
 from rlctl.checking.worlds import Array
 
 RULE = Rule(
@@ -69,7 +70,7 @@ def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
         return  # the engine's values have told it
     scaled: ScaledGoal | None = records.facts.get(SCALED_GOAL)
     if scaled is not None and scaled.size >= LEAST_LARGE:
-        yield _describe_scaled(scaled)
+        yield _describe_scaled(scaled, built)
         return
     log: AttributeLog | None = records.facts.get("attributes")
     if log is not None and (scaled_pair := _find_scaled_pair(log)) is not None:
@@ -135,8 +136,8 @@ def _describe_pair(pair: _ScaledPair, names: Sequence[str]) -> RuleFinding:
     return RuleFinding(RULE, message, {"element": name, "value": pair.unit.factor, "expected": 1.0})
 
 
-def _describe_scaled(goal: ScaledGoal) -> RuleFinding:
-    name = f"observation[{goal.element}]"
+def _describe_scaled(goal: ScaledGoal, built: Built) -> RuleFinding:
+    name = name_numbers(list_float_parts(built.leaves), goal.element)
     small = next(unit.small for unit in UNITS if unit.factor == goal.factor)
     message = f"{name} follows {goal.name} times {goal.factor:g}: {small}, if that is in metres"
     return RuleFinding(RULE, message, {"element": name, "value": goal.factor, "expected": 1.0})

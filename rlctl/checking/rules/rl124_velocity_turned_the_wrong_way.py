@@ -19,6 +19,7 @@ from rlctl.checking.readings import NEARLY_ALL
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.shared_frames import Turn, list_world_turns
+from rlctl.checking.values import ArrayNames, name_numbers
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
 RULE = Rule(
@@ -65,9 +66,9 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         found = [
             finding
             for vectors in [*_list_velocities(one), *_list_gravities(one)]
-            for finding in _find_in_observation(one.observed, vectors)
+            for finding in _find_in_observation(one.logs[0].parts, one.observed, vectors)
         ]
-        yield from found or _find_directions(one.observed, one.episodes, list_world_turns(one))
+        yield from found or _find_directions(one.logs[0].parts, one.observed, one.episodes, list_world_turns(one))
 
 
 @judges_records(RULE, "worlds", "attributes")
@@ -89,16 +90,18 @@ def find_wrong_turns(log: AttributeLog) -> Iterator[RuleFinding]:
     """Yield the first velocity, or gravity, that a robot without an engine observes turned the wrong way."""
     for frame in find_body_frames(log):
         for vectors in _list_vectors(frame):
-            for finding in _find_in_observation(log.observed, vectors):
+            for finding in _find_in_observation(log.parts, log.observed, vectors):
                 yield finding
                 return
-    yield from _find_directions(log.observed, log.episodes, list_body_turns(log))
+    yield from _find_directions(log.parts, log.observed, log.episodes, list_body_turns(log))
 
 
-def _find_directions(observed: Array, episodes: NDArray[np.int_], turns: Sequence[Turn]) -> Iterator[RuleFinding]:
+def _find_directions(
+    parts: ArrayNames, observed: Array, episodes: NDArray[np.int_], turns: Sequence[Turn]
+) -> Iterator[RuleFinding]:
     """Yield the first direction that is fixed in the world, turned the wrong way."""
     for column, turn in find_turned_directions(observed, episodes, turns):
-        name = f"observation[{column}:{column + 3}]"
+        name = name_numbers(parts, column, 3)
         message = f"{name} is a direction that reset draws, turned by {turn.name} the wrong way: it moves as what is"
         yield RuleFinding(RULE, f"{message} fixed to the body, not to the world", {"element": name, "value": turn.name})
         return
@@ -150,14 +153,14 @@ def _turn(name: str, values: Array, quaternions: Array, *, is_own: bool) -> _Vec
     return _Vectors(name, [values, inside, level], [outside, twice])
 
 
-def _find_in_observation(observed: Array, vectors: _Vectors) -> Iterator[RuleFinding]:
+def _find_in_observation(parts: ArrayNames, observed: Array, vectors: _Vectors) -> Iterator[RuleFinding]:
     size = vectors.wrong[0].shape[1]
     for column in range(observed.shape[1] - size + 1):
         block = observed[:, column : column + size]
         is_wrong = any(_fits(block, vectors, wrong) for wrong in vectors.wrong)
         if not is_wrong or any(_fits(block, vectors, right) for right in vectors.right):
             continue
-        name = f"observation[{column}:{column + size}]"
+        name = name_numbers(parts, column, size)
         message = f"{name} is {vectors.name}, turned by the orientation the wrong way: in no frame of the robot"
         yield RuleFinding(RULE, message, {"element": name, "value": vectors.name})
         return

@@ -69,7 +69,7 @@ def _find_turned_goals(trials: GoalTrials) -> Iterator[ChildMessage]:
         frame = _find_wrong_frame(trials, element)
         if frame:
             size = trials.goals.shape[1]
-            name = f"observation[{element}:{element + size}]"
+            name = trials.name_elements(element, size)
             message = f"{name} is the way to {trials.drawn.name}, turned by the orientation of {frame} the wrong way"
             evidence = {"element": name, "seed": FIRST_SEED, "value": frame}
             yield RuleFinding(RULE, f"{message}: in no frame of the robot", evidence)

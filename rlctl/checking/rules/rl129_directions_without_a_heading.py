@@ -74,7 +74,7 @@ def _find_world_vectors(robot: RotatedRobot) -> Iterator[RuleFinding]:
         yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, severity)
     if turns.any():
         return
-    rewards = [np.array([episode.rewards for episode in turning.episodes]) for turning in turnings]
+    rewards = [np.array([episode.rewards for episode in turning.common]) for turning in turnings]
     spread = float(np.ptp(np.concatenate([each[0] for each in rewards])))
     least = max(TINY, MATTERS * spread)
     if np.mean([np.ptp(each, axis=0).max() > least for each in rewards]) > MOSTLY:
@@ -106,8 +106,8 @@ def _shows_heading(turnings: Sequence[Turning]) -> bool:
     direction seen from the robot, such as its velocity; or one that is observed in the frame of the robot too."""
     turns = np.any([turning.turns for turning in turnings], axis=0)
     amplitudes = np.concatenate([turning.amplitudes for turning in turnings])
-    phases = np.concatenate([turning.phases + turning.episodes[0].headings[:, None] for turning in turnings])
-    observed = np.concatenate([turning.episodes[0].observed for turning in turnings])
+    phases = np.concatenate([turning.phases + turning.common[0].headings[:, None] for turning in turnings])
+    observed = np.concatenate([turning.common[0].observed for turning in turnings])
     columns = np.flatnonzero(turns).tolist()
     if any(np.std(amplitudes[:, column]) < SAME * np.mean(amplitudes[:, column]) for column in columns):
         return True

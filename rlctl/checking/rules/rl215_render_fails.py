@@ -47,6 +47,8 @@ def render(context: Context) -> Iterator[ChildMessage]:
     except EnvironmentRaised as error:
         if find_missing_file(error.cause) is not None:
             raise NotJudged("a file that the environment loads is missing (RL007)") from None
+        if error.call == "reset" and not instance.accepts_seed:
+            raise NotJudged("reset takes no seed (RL202)") from None
         raised = str(error)
         causes = get_causes(error.cause)
         if any(isinstance(e, ImportError) or type(e).__name__ == "DependencyNotInstalled" for e in causes):

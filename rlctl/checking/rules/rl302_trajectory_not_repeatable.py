@@ -16,7 +16,7 @@ RULE = Rule(
         depend on the seed, or reset does not reset everything.
     """,
     fix="""
-        Call super().reset(seed=seed) and draw only from self.np_random; use no np.random.*, random.* or time.
+        Call super().reset(seed=seed) first, and draw only from self.np_random; use no np.random.*, random.* or time.
         Reset every attribute that step changes.
     """,
     task_fix="""

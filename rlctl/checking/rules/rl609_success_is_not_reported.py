@@ -20,7 +20,7 @@ RULE = Rule(
     fix="Put info['is_success'] = bool(...) into every step's info; with rlctl.task, write is_success().",
 )
 
-OTHER_NAMES = ("success", "succeeded", "goal_reached", "is_goal")
+OTHER_NAMES = ("success", "succeed", "succeeded", "goal_reached", "is_goal")
 
 
 @judges_records(RULE, *rewards.WITH_SEARCH, of_absence=True)

@@ -69,7 +69,7 @@ def _find_other_link(trials: GoalTrials) -> Iterator[ChildMessage]:
     if objects or not at_goal.reports_success or at_goal.source is not None:
         return
     for name in [*(_find_links(trials) if relative else []), *_find_places(trials, ways[0])]:
-        observed = f"observation[{ways[0][0]}]"
+        observed = trials.name_elements(ways[0][0])
         message = f"is_success is true with {trials.drawn.name} at {name}, and not where {observed}"
         message += f" and what follows it are 0, which is {trials.drawn.name} minus another place"
         yield RuleFinding(RULE, message, {"element": observed, "seed": FIRST_SEED, "value": name})
@@ -135,9 +135,10 @@ def _judge_objects(trials: GoalTrials, source: Source, objects: Mapping[Source, 
     if source in objects or any(trials.is_success_at(one) for one in objects):
         return
     (element, _), name = next(iter(objects.items()))
-    message = f"is_success is true with {trials.drawn.name} where observation[{source[0]}] and what follows it are,"
-    message += f" and false with it at {name}, which is observed relative to it (observation[{element}])"
-    yield RuleFinding(RULE, message, {"element": f"observation[{element}]", "seed": FIRST_SEED, "value": name})
+    place, way = trials.name_elements(source[0]), trials.name_elements(element)
+    message = f"is_success is true with {trials.drawn.name} where {place} and what follows it are,"
+    message += f" and false with it at {name}, which is observed relative to it ({way})"
+    yield RuleFinding(RULE, message, {"element": way, "seed": FIRST_SEED, "value": name})
 
 
 def _find_object_sources(trials: GoalTrials) -> dict[Source, str]:

@@ -65,6 +65,8 @@ def _measure(shown: ActionTrials, seed: int, at: int) -> _Answers | None:
     trials = shown.trials
     plain, changed = trials.plain(seed, STEPS), _change(shown, trials, seed, at)
     differences = find_differences(plain, changed, ROUNDING)
+    if any(step <= at for step in differences):  # by what an episode has left over, and not by the action
+        return None
     steps = np.array([step - at for step, columns in differences.items() if REWARD in columns and step > at + COSTS])
     last = min(len(plain), len(changed)) - 1 - at
     if not steps.size or last - steps[0] < FEWEST_AFTER or len(steps) < MOSTLY * (last - steps[0] + 1):

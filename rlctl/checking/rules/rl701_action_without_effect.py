@@ -139,12 +139,14 @@ def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
 def _find_dead_half(trials: Trials, dimension: ActionNumber) -> list[str]:
     low, high = dimension.ends
 
-    def is_same(one: float, two: float) -> bool:
-        return trials.has_same_effect(dimension, one, two)
+    def is_same(one: float, two: float, before: float | None = None) -> bool:
+        return trials.has_same_effect(dimension, one, two, before)
 
     middle = (low + high) / 2
     for end, other in ((low, high), (high, low)) if "float" in dimension.leaf.dtype else ():
-        if is_same(end, middle) and is_same(end, (end + middle) / 2) and not is_same(other, (other + middle) / 2):
+        is_dead = is_same(end, middle) and is_same(end, (end + middle) / 2)
+        # An action that changes what is at its limit already, as a closed valve, acts after the other end.
+        if is_dead and not is_same(other, (other + middle) / 2) and is_same(end, middle, before=other):
             return [f"{dimension.name} from {min(end, middle):g} to {max(end, middle):g}"]
     return []
 

@@ -10,6 +10,7 @@ from rlctl.checking.action_trials import REWARD, ActionNumber, Trials
 from rlctl.checking.experiments.action_effects import ActionTrials, judges_actions
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import OutOfTime, Rule, RuleFinding, Severity, list_names
+from rlctl.checking.values import name_numbers
 
 RULE = Rule(
     "RL707",
@@ -60,13 +61,14 @@ def _find_falls(shown: ActionTrials) -> Iterator[RuleFinding]:
     names = list_names([one.name for one in alone or floats])
     one = (alone or floats)[0]
     low, high = (_find_value(one, part) for part in (jump.low, jump.high))
-    message = f"observation[{jump.column}] follows {names}, but falls back by {abs(jump.size):.4g} between"
+    observed = name_numbers(shown.trials.parts, jump.column)
+    message = f"{observed} follows {names}, but falls back by {abs(jump.size):.4g} between"
     message += f" {low:.4g} and {high:.4g}: from {before[jump.column]:.4g} to {after[jump.column]:.4g}"
     evidence = {
         "element": one.name,
         "value": [low, high],
         "seed": FIRST_SEED,
-        "observed": f"observation[{jump.column}]",
+        "observed": observed,
     }
     yield RuleFinding(RULE, message, evidence)
 

@@ -20,9 +20,9 @@ RULE = Rule(
         forces that no real contact has, and policies exploit them.
     """,
     fix="""
-        Start without overlap (getClosestPoints shows it), take shorter physics steps or more substeps, keep
-        masses within a factor of 100 of each other, and drive joints with limited forces instead of resetting
-        their state.
+        Start without overlap (PyBullet's getClosestPoints, and in MuJoCo data.contact after mj_forward, show it), take
+        shorter physics steps or more substeps, keep masses within a factor of 100 of each other, and drive joints with
+        limited forces instead of resetting their state.
     """,
 )
 

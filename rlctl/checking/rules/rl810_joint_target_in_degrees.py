@@ -7,8 +7,8 @@ import numpy as np
 
 from rlctl.checking.angle_mistakes import AngleMistakes, find_first
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
-from rlctl.checking.joint_copies import DEGREES, JointCopy
+from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
+from rlctl.checking.joint_copies import DEGREES
 from rlctl.checking.motor_commands import CommandSpan
 from rlctl.checking.motor_targets import APART, DEGREE, ROUNDED, covers, read_first_targets
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names, list_others
@@ -59,7 +59,7 @@ def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         if not motors and not targets:
             yield from find_ranges_in_degrees(spans)
     for one in watched.observed:
-        yield from _find_shrunk_copies(one.copies)
+        yield from _find_shrunk_copies(one)
 
 
 def find_targets_in_degrees(world: LoggedWorld, calls: BulletCalls) -> list[RuleFinding]:
@@ -181,11 +181,11 @@ def find_ranges_in_degrees(spans: Sequence[CommandSpan]) -> Iterator[RuleFinding
             return
 
 
-def _find_shrunk_copies(copies: Sequence[JointCopy]) -> Iterator[RuleFinding]:
+def _find_shrunk_copies(one: ObservedWorld) -> Iterator[RuleFinding]:
     """Yield a joint's position in the observation that was converted although it was in radians."""
-    shrunk = [copy for copy in copies if copy.is_scaled(1 / DEGREES) and not copy.is_speed]
+    shrunk = [copy for copy in one.copies if copy.is_scaled(1 / DEGREES) and not copy.is_speed]
     for copy in shrunk[:1]:
-        name = f"observation[{copy.column}]"
-        others = list_others([f"observation[{other.column}]" for other in shrunk])
+        name = one.name_element(copy.column)
+        others = list_others([one.name_element(other.column) for other in shrunk])
         message = f"{name} is {copy.name} times pi / 180{others}: it was in radians already"
         yield RuleFinding(RULE, message, {"element": name, "value": copy.joint.name, "expected": "radians"})

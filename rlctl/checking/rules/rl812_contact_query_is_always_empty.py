@@ -61,7 +61,7 @@ def _find_untouched_parts(trials: MujocoTrials) -> Iterator[RuleFinding]:
             if columns == [size] and any((kind, other) in calls.asked for other, _ in swapped.values()):
                 columns = []  # the reward may count the neighbour's contacts, too
             if columns:
-                yield _untouched(kind, swapped, name_columns(columns, size), name_columns(columns[:1], size))
+                yield _untouched(kind, swapped, name_columns(columns, plain[0]), name_columns(columns[:1], plain[0]))
                 return
 
 

@@ -30,6 +30,7 @@ from rlctl.checking.records import FIRST_SEED, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.shared_frames import name_elements, name_part
 from rlctl.checking.start_readings import StartReadings
+from rlctl.checking.values import name_numbers
 from rlctl.checking.world_logs import LoggedWorld, WorldLog
 from rlctl.checking.worlds import Array
 from rlctl.environments.bullet_calls import BulletCalls
@@ -144,27 +145,41 @@ def _judge_trials(trials: MujocoTrials) -> Iterator[RuleFinding]:
 
 
 def _find_stale(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
-    refreshing = RefreshAfterSteps()
-    changed = play(instance, calls, after_step=refreshing, as_stepped=refreshing.as_stepped)
-    pair = pair_rows(plain, changed)
-    if pair is None or len(pair[0]) < FEWEST_TRIAL_LOOKS:
+    pair = _pair_refreshed(instance, calls, plain)
+    if pair is None:
         return
     old, new = (part[1:] for part in pair)  # a reset has no step
     off, moves = np.abs(new - old).max(axis=0), np.abs(np.diff(new, axis=0)).max(axis=0)
     columns = np.flatnonzero(off > SAME_READING * (1 + np.abs(new).max(axis=0))).tolist()
     if not columns:
         return
-    size, fields = new.shape[1] - 1, find_fields(instance, calls, columns)
+    fields = find_fields(instance, calls, columns)
     shown = sorted(columns, key=lambda c: c not in fields)
-    texts = [f"{name_columns([c], size)}{f' ({fields[c]})' if c in fields else ''}" for c in shown]
+    texts = [f"{name_columns([c], plain[0])}{f' ({fields[c]})' if c in fields else ''}" for c in shown]
     verb, worst = "is" if len(columns) == 1 else "are", shown[0]
     value, step = float(off[worst]), int(np.abs(new - old)[:, worst].argmax())
     what = f"{list_names(texts, 4)} {verb} computed from what mj_step leaves one substep old"
     message = f"{what}: {texts[0]} is off by up to {value:.3g}, a step changes it by up to {moves[worst]:.3g}"
-    evidence = {"element": name_columns([worst], size), "seed": FIRST_SEED, "step": step + 1}
+    evidence = {"element": name_columns([worst], plain[0]), "seed": FIRST_SEED, "step": step + 1}
     evidence |= {"value": float(old[step, worst]), "expected": float(new[step, worst])}
     severity = Severity.WARNING if (off[columns] > TINY * moves[columns]).any() else Severity.INFO
     yield RuleFinding(RULE, message, evidence, severity, fix=FORWARD)
+
+
+def _pair_refreshed(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> tuple[Array, Array] | None:
+    """Return what an episode observes, and what it would with all up to date after each step; None for too few rows."""
+    refreshing = RefreshAfterSteps()
+    hooks: dict[str, Any] = {"after_step": refreshing, "as_stepped": refreshing.as_stepped}
+    pair = pair_rows(plain, play(instance, calls, **hooks))
+    if pair is not None and len(pair[0]) >= FEWEST_TRIAL_LOOKS:
+        return pair
+    # A controller reads it too, and moves the robot otherwise: it gets what it had. A reward may compare both.
+    hooks |= {"after_forward": refreshing.forget, "after_reset": refreshing.forget, "after_look": refreshing.restore}
+    pair = pair_rows(plain, play(instance, calls, **hooks))
+    if pair is None or len(pair[0]) < FEWEST_TRIAL_LOOKS:
+        return None
+    pair[1][:, -1] = pair[0][:, -1]
+    return pair
 
 
 def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Look]) -> Iterator[RuleFinding]:
@@ -178,15 +193,15 @@ def _find_unforwarded(instance: Instance, calls: MujocoCalls, plain: Sequence[Lo
     if columns:
         size = plain[0].observation.size
         verb = "is" if len(columns) == 1 else "are"
-        what = f"{name_columns(columns, size)} of reset {verb} computed before mj_forward"
+        what = f"{name_columns(columns, plain[0])} of reset {verb} computed before mj_forward"
         message = f"{what}: from poses and sensors as they were before qpos was written"
         elements = [column for column in columns if column < size]
         if elements and not plain[0].observation[elements].any():
             message = (
-                f"{name_columns(elements, size)} of reset {verb} 0: nothing computes poses and sensors before the "
+                f"{name_columns(elements, plain[0])} of reset {verb} 0: nothing computes poses and sensors before the "
             )
             message += "first step"
-        evidence = {"element": name_columns(columns[:1], size), "call": "reset", "seed": FIRST_SEED}
+        evidence = {"element": name_columns(columns[:1], plain[0]), "call": "reset", "seed": FIRST_SEED}
         yield RuleFinding(RULE, message, evidence, Severity.WARNING, fix=FORWARD_AT_RESET)
 
 
@@ -232,7 +247,7 @@ def _find_old_elements(world: LoggedWorld, fix: str) -> Iterator[RuleFinding]:
         if earlier.any() and not present.any():
             old[column] = names[int(earlier.argmax())]
     if old:
-        yield _describe_old(old, "before the last step of the physics, not of the present one", fix)
+        yield _describe_old(logs[0], old, "before the last step of the physics, not of the present one", fix)
 
 
 def _find_elements_of_last_look(world: LoggedWorld, fix: str) -> Iterator[RuleFinding]:
@@ -258,7 +273,7 @@ def _find_elements_of_last_look(world: LoggedWorld, fix: str) -> Iterator[RuleFi
         for column in _find_sums(observed[:, columns], now, before, of_kind):
             old.setdefault(columns[column], what)
     if old:
-        yield _describe_old(old, "before the whole step, not of the one after it", fix)
+        yield _describe_old(logs[0], old, "before the whole step, not of the one after it", fix)
 
 
 def _find_sums(observed: Array, now: Array, before: Array, features: Sequence[int]) -> list[int]:
@@ -291,11 +306,12 @@ def _fit(features: Array, observed: Array) -> tuple[Array, Array] | None:
     return weights, np.asarray(np.abs(observed[rest] - features[rest] @ weights).max(axis=0))
 
 
-def _describe_old(old: Mapping[int, str], when: str, fix: str) -> RuleFinding:
-    elements = [f"observation[{column}] ({name})" for column, name in old.items()]
+def _describe_old(log: WorldLog, old: Mapping[int, str], when: str, fix: str) -> RuleFinding:
+    names = [name_numbers(log.parts, column) for column in old]
+    elements = [f"{name} ({what})" for name, what in zip(names, old.values(), strict=True)]
     verb = "is" if len(elements) == 1 else "are"
     message = f"{list_names(elements, 4)} {verb} of the state {when}"
-    evidence = {"element": f"observation[{next(iter(old))}]", "elements": [f"observation[{c}]" for c in old][:8]}
+    evidence = {"element": names[0], "elements": names[:8]}
     return RuleFinding(RULE, message, evidence, Severity.WARNING, fix=fix)
 
 

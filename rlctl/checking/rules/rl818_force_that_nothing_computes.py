@@ -52,7 +52,7 @@ def _find_never_computed(trials: MujocoTrials) -> Iterator[RuleFinding]:
         columns = [] if pair is None else np.flatnonzero((pair[0] != pair[1]).any(axis=0)).tolist()
         if columns and pair is not None:
             verb = "is" if len(columns) == 1 else "are"
-            what = f"{name_columns(columns, pair[0].shape[1] - 1)} {verb} computed from data.{name}"
+            what = f"{name_columns(columns, plain[0])} {verb} computed from data.{name}"
             message = f"{what}, which stays zero: nothing calls {NEVER_COMPUTED[name]}"
             yield RuleFinding(RULE, message, {"element": f"data.{name}", "value": 0.0})
             simulation = find_mujoco(instance.env)

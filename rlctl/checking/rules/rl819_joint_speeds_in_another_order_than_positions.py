@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
-from rlctl.checking.experiments.worlds import WatchedWorlds, judges_worlds
+from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.joint_copies import JointCopy
 from rlctl.checking.paired_states import PairedStates
 from rlctl.checking.rule import Rule, RuleFinding, Severity
@@ -36,12 +36,12 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
 @judges_worlds(RULE)
 def _judge_worlds(watched: WatchedWorlds) -> Iterator[RuleFinding]:
     for one in watched.observed:
-        yield from _find_other_order(one.copies)
+        yield from _find_other_order(one)
 
 
-def _find_other_order(copies: Sequence[JointCopy]) -> Iterator[RuleFinding]:
+def _find_other_order(one: ObservedWorld) -> Iterator[RuleFinding]:
     """Yield a block of speeds that has the joints of a block of positions in another order."""
-    blocks = _find_blocks(copies)
+    blocks = _find_blocks(one.copies)
     orders = [[copy.key for copy in block] for block in blocks if not block[0].is_speed]
     for block in (block for block in blocks if block[0].is_speed):
         order = [copy.key for copy in block]
@@ -49,7 +49,7 @@ def _find_other_order(copies: Sequence[JointCopy]) -> Iterator[RuleFinding]:
         if alike and order not in alike:
             positions = next(b for b in blocks if not b[0].is_speed and [c.key for c in b] == alike[0])
             names = [", ".join(copy.joint.name for copy in some) for some in (positions, block)]
-            places = [f"observation[{some[0].column}:{some[-1].column + 1}]" for some in (positions, block)]
+            places = [one.name_elements(some[0].column, len(some)) for some in (positions, block)]
             message = f"{places[0]} are the positions of {names[0]}; {places[1]} are the speeds of {names[1]}"
             yield RuleFinding(RULE, message, {"element": places[1], "value": names[1], "expected": names[0]})
             return

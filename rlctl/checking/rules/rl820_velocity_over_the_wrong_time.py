@@ -200,7 +200,7 @@ def _find_wrong_times(one: ObservedWorld, changes: _Changes) -> Iterator[RuleFin
 
 
 def _describe_physics(one: ObservedWorld, wrong: Sequence[_WrongTime], changes: _Changes) -> RuleFinding:
-    names = [_name_columns(one, each.columns) for each in wrong]
+    names = [one.name_elements(each.columns.start, each.columns.stop - each.columns.start) for each in wrong]
     what = f"{names[0]} is the change of {wrong[0].what} in a step, divided by {changes.time_step:.4g} s"
     taken = f"the step takes {changes.seconds:.4g} s, {changes.substeps} steps of the physics"
     message = f"{what}{list_others(names)}; {taken}: it is {changes.substeps} times too large"
@@ -210,7 +210,7 @@ def _describe_physics(one: ObservedWorld, wrong: Sequence[_WrongTime], changes: 
 
 def _describe_other(one: ObservedWorld, wrong: Sequence[_WrongTime], changes: _Changes) -> RuleFinding:
     """Describe a change that is not divided; an info where nothing says that it is meant as a velocity."""
-    names = [_name_columns(one, each.columns) for each in wrong]
+    names = [one.name_elements(each.columns.start, each.columns.stop - each.columns.start) for each in wrong]
     what = f"{names[0]} is the change of {wrong[0].what} in a step{list_others(names)}"
     taken = f"not divided by the {changes.seconds:.4g} s that a step takes"
     speed = next((scaled for scaled in one.scaled if scaled.value.is_speed and scaled.has_factor(1.0)), None)
@@ -224,12 +224,6 @@ def _describe_other(one: ObservedWorld, wrong: Sequence[_WrongTime], changes: _C
         why, severity = "if it is meant as a velocity, it depends on the length of the step", Severity.INFO
     evidence = {"element": names[0], "value": wrong[0].seconds, "expected": changes.seconds}
     return RuleFinding(RULE, f"{what}, {taken}; {why}", evidence, severity)
-
-
-def _name_columns(one: ObservedWorld, columns: slice) -> str:
-    if columns.stop == columns.start + 1:
-        return one.name_element(columns.start)
-    return f"observation[{columns.start}:{columns.stop}]"
 
 
 def _match_elements(changes: _Changes) -> Iterator[_WrongTime]:
