@@ -90,6 +90,31 @@ class RL647BoatForgetsItsTurns(BoatTurnsSlowly):
         return float(reward)
 
 
+class BoatChargesForTurns(BoatTurnsSlowly):
+    def reward(self):
+        distance_cost = self.distance()
+        turning_cost = 0.1 * self.speed[1] ** 2
+        return -(distance_cost + turning_cost)
+
+
+class RL647BoatForgetsToCharge(BoatTurnsSlowly):
+    def reward(self):
+        distance_cost = self.distance()
+        turning_cost = 0.1 * self.speed[1] ** 2  # noqa: F841
+        return -distance_cost
+
+
+class BoatTellsOfItsTurns(BoatTurnsSlowly):
+    """What it pays for its turns is not in its reward, and read."""
+
+    def reward(self):
+        distance_cost = self.distance()
+        turning_cost = 0.1 * self.speed[1] ** 2
+        lost_bonus = 0.0  # noqa: F841
+        self.told = f"{turning_cost:.3f}"
+        return -distance_cost
+
+
 class BoatSpares(BoatTurnsSlowly):
     def reward(self):
         effort = np.sum(np.square(self.taken))

@@ -143,6 +143,7 @@ SHOWN = {
         "BoatTurnsFromItself": ("RL620", "BoatTurnsSlowly"),
         "BoatLeavesItsCourse": ("RL634", "BoatKeepsCourse"),
         "RL647BoatForgetsItsTurns": ("RL647", "BoatTurnsSlowly"),
+        "RL647BoatForgetsToCharge": ("RL647", "BoatChargesForTurns"),
         "BoatSpends": ("RL621", "BoatSpares"),
         "BoatIsPaidForBeingLost": ("RL621", "BoatStopsPaying"),
         "BoatLimitsItsTurnsTheWrongWay": ("RL645", "BoatLimitsItsTurns"),
@@ -167,7 +168,7 @@ SOUND = {
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
     "broken_starts.py": ["HopperOfFriction"],
-    "broken_success.py": ["BoatIsPaidForItsRest"],
+    "broken_success.py": ["BoatIsPaidForItsRest", "BoatTellsOfItsTurns"],
     "broken_unwrapped.py": ["ValveHasStops"],
 }
 """What looks like one of these mistakes, and is none."""

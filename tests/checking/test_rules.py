@@ -236,6 +236,15 @@ def test_difference_is_named():
 
 
 @pytest.mark.slow
+@pytest.mark.pybullet
+def test_a_shared_world_is_told_beside_a_shared_generator():
+    every = findings("broken_repeats.py:SharedWorldThatDraws", "RL401", "RL309", "RL808")
+    (finding,) = [finding for finding in every if finding.rule == "RL401"]
+    assert "both use PyBullet's client 0 (RL808), and draw from a global random generator (RL309)" in finding.message
+    assert "physicsClientId" in finding.fix
+
+
+@pytest.mark.slow
 def test_state_that_reset_keeps_is_named():
     (finding,) = findings("broken_repeats.py:OldActions", "RL301")
     element = finding.evidence["element"]
