@@ -97,7 +97,7 @@ class BoatChargesForTurns(BoatTurnsSlowly):
         return -(distance_cost + turning_cost)
 
 
-class RL647BoatForgetsToCharge(BoatTurnsSlowly):
+class BoatForgetsToCharge(BoatTurnsSlowly):
     def reward(self):
         distance_cost = self.distance()
         turning_cost = 0.1 * self.speed[1] ** 2  # noqa: F841
@@ -113,6 +113,22 @@ class BoatTellsOfItsTurns(BoatTurnsSlowly):
         lost_bonus = 0.0  # noqa: F841
         self.told = f"{turning_cost:.3f}"
         return -distance_cost
+
+
+class BoatNeverOwes(BoatTurnsSlowly):
+    """What it has to pay is no more than what it earns near its buoy."""
+
+    def reward(self):
+        earned = 1.0 - 0.3 * self.distance()
+        return max(0.0, earned)
+
+
+class BoatAlwaysOwes(BoatTurnsSlowly):
+    """Its rewards are small beside its costs, and clipped."""
+
+    def reward(self):
+        earned = 1.0 - 0.3 * self.distance()
+        return max(0.0, earned - 20.0 * abs(self.heading - 9.0))
 
 
 class BoatSpares(BoatTurnsSlowly):
