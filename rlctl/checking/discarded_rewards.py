@@ -50,14 +50,18 @@ def find_unread_terms(notes: NotedEpisodes) -> Iterator[Assignment]:
         if read & READ_BY_NAME or not read & {*terms}:
             continue
         for name, assignments in terms.items():
-            if name not in read and all(_is_computed(notes, one) for one in assignments):
+            if name not in read and all(_is_own(one) and _is_computed(one.value) for one in assignments):
                 yield assignments[0]
 
 
-def _is_computed(notes: NotedEpisodes, one: Assignment) -> bool:
-    """Say whether a variable gets a value of its own that is not a constant. What is unpacked among others, as from
-    super().step(action), need not be used."""
-    return one.element is None and not one.is_part and notes.reward.numbers.read_constant(one.value) is None
+def _is_own(one: Assignment) -> bool:
+    """Say whether a variable gets a value of its own: what is unpacked among others, as from super().step(action),
+    need not be used."""
+    return one.element is None and not one.is_part
+
+
+def _is_computed(node: ast.expr) -> bool:
+    return any(isinstance(one, ast.Name | ast.Call) for one in ast.walk(node))
 
 
 def _compare(
@@ -69,7 +73,8 @@ def _compare(
             continue
         first, last = block.index(before.statement), block.index(after.statement)
         reads = [node for one in block[first + 1 : last + 1] for node in ast.walk(one) if _reads(node, name)]
-        if first < last and not reads and _is_computed(notes, before):
+        is_constant = notes.reward.numbers.read_constant(before.value) is not None
+        if first < last and not reads and _is_own(before) and not is_constant:
             yield DiscardedReward(before, after)
 
 

@@ -115,12 +115,9 @@ class BoatTellsOfItsTurns(BoatTurnsSlowly):
         return -distance_cost
 
 
-class BoatNeverOwes(BoatTurnsSlowly):
-    """What it has to pay is no more than what it earns near its buoy."""
-
+class BoatOwesUntilItIsNear(BoatTurnsSlowly):
     def reward(self):
-        earned = 1.0 - 0.3 * self.distance()
-        return max(0.0, earned)
+        return min(0.0, 0.05 - 0.3 * self.distance())
 
 
 class BoatAlwaysOwes(BoatTurnsSlowly):

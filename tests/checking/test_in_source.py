@@ -143,7 +143,7 @@ SHOWN = {
         "BoatTurnsFromItself": ("RL620", "BoatTurnsSlowly"),
         "BoatLeavesItsCourse": ("RL634", "BoatKeepsCourse"),
         "RL647BoatForgetsItsTurns": ("RL647", "BoatTurnsSlowly"),
-        "BoatAlwaysOwes": ("RL602", "BoatNeverOwes"),
+        "BoatAlwaysOwes": ("RL602", "BoatOwesUntilItIsNear"),
         "BoatForgetsToCharge": ("RL647", "BoatChargesForTurns"),
         "BoatSpends": ("RL621", "BoatSpares"),
         "BoatIsPaidForBeingLost": ("RL621", "BoatStopsPaying"),
