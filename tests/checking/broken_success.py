@@ -128,6 +128,21 @@ class BoatAlwaysOwes(BoatTurnsSlowly):
         return max(0.0, earned - 20.0 * abs(self.heading - 9.0))
 
 
+class BoatKeepsToItsLane(BoatTurnsSlowly):
+    """It pays for what is beyond its lane, to either side."""
+
+    def reward(self):
+        return -self.distance() - self.lane_penalty(self.place[1])
+
+    def lane_penalty(self, offset):
+        penalty = 0.0
+        if offset > 0.2:
+            penalty += (offset - 0.2) * 0.5
+        elif offset < -0.2:
+            penalty += (-0.2 - offset) * 0.5
+        return penalty
+
+
 class BoatSpares(BoatTurnsSlowly):
     def reward(self):
         effort = np.sum(np.square(self.taken))

@@ -169,7 +169,7 @@ SOUND = {
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
     "broken_starts.py": ["HopperOfFriction"],
-    "broken_success.py": ["BoatIsPaidForItsRest", "BoatTellsOfItsTurns"],
+    "broken_success.py": ["BoatIsPaidForItsRest", "BoatKeepsToItsLane", "BoatTellsOfItsTurns"],
     "broken_unwrapped.py": ["ValveHasStops"],
 }
 """What looks like one of these mistakes, and is none."""
