@@ -36,6 +36,7 @@ CASES = [
     case("broken_envs.py:RL103OftenOutOfRange", ("RL103", "error")),
     case("broken_envs.py:RL103LastOutOfRange", ("RL103", "info")),
     case("broken_envs.py:RL103Rounding", ("RL103", "warning")),
+    case("broken_envs.py:RL103OftenSlightlyOutOfRange", ("RL103", "warning"), slow=True),
     case("broken_envs.py:RL104NanObservation", ("RL104", "error")),
     case("broken_envs.py:RL105ReusedMemory", ("RL105", "info"), slow=True),
     case("broken_envs.py:RL106UnboundedActions", ("RL106", "error")),
