@@ -164,6 +164,7 @@ SOUND = {
     "broken_exchanged.py": ["BoatLooksBack"],
     "broken_fields.py": ["RamApart", "RamOtherNames"],
     "broken_frames.py": ["BargeTurnsInPartsOfATurn"],
+    "broken_idle.py": ["SkiffKnowsItsCourse"],
     "broken_late.py": ["CrabSteersByIt", "CrabKeepsAView", "CrabKeepsTime", "SnailRemembers", "SnailGains"],
     "broken_parts.py": ["BoatStartsItsEngine", "BoatBrakes", "BoatSaturates"],
     "broken_previous.py": ["BoatRestOfCourse"],
