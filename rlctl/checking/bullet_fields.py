@@ -13,6 +13,7 @@ from rlctl.checking.term_names import split_name
 PLACE, TURN = {"pos", "position", "positions"}, {"orn", "orientation", "quat", "quaternion"}
 LINEAR = {"lin", "linear", "linvel", "vx", "vy", "vz"}
 ANGULAR = {"ang", "angular", "omega", "gyro", "angvel"}
+ANGLED = ANGULAR | {"angle", "attitude", "euler", "rot", "rotation"}
 PLAIN = {"vel", "velocity", "speed", "v"}  # of a base: what is angular is called so
 TURNS = {"w", "rot", "turn", "turning", "spin", "yaw", "roll", "pitch", "rate", "rates", "wheel", "twist"}
 SPEED = {"vel", "vels", "velocity", "velocities", "speed", "speeds", "qvel", "qd", "dq", "qdot", "rate", "rates"}
@@ -229,6 +230,8 @@ def find_other_meaning(read: ReadField, name: str) -> tuple[str, str, int] | Non
         called = [kind for kind in called if kind != "normal"]
     if len(called) != 1 or called[0] in own or (words & OTHER_MEANINGS - kinds[called[0]][1]):
         return None
+    if called == ["position"] and "orientation" in kinds and words & ANGLED:
+        return None  # an angular position
     if called == ["normal"] and read.field not in (5, 6, 8):
         return None  # the normal force
     return (own[0] if own else "something else"), called[0], min(kinds[called[0]][0])

@@ -1,4 +1,5 @@
-"""Where the source throws away what it has added up for the reward, since it sets it where it should add to it."""
+"""Where the source throws away a part of the reward: it sets the reward where it should add to it, or computes a term
+that nothing reads."""
 
 import ast
 import dataclasses
@@ -9,7 +10,10 @@ from rlctl.checking.assignments import Assignment
 from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.source_code import Function
 from rlctl.checking.summands import REWARD_NAMES
-from rlctl.checking.term_names import split_name
+from rlctl.checking.term_names import COST_WORDS, split_name
+
+TERM_WORDS = {*COST_WORDS, "bonus", "rew", "reward"}
+READ_BY_NAME = {"eval", "exec", "locals", "vars"}  # functions that may read any local variable
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,6 +34,36 @@ def find_discarded_rewards(notes: NotedEpisodes) -> Iterator[DiscardedReward]:
                 yield from _compare(notes, function, text, assignments)
 
 
+def find_unread_terms(notes: NotedEpisodes) -> Iterator[Assignment]:
+    """Yield what a step computes as terms of the reward and never reads, beside terms that it does read."""
+    for function in notes.functions:
+        if function not in notes.of_steps:
+            continue
+        nodes = list(ast.walk(function))
+        read = {node.id for node in nodes if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Store)}
+        read |= {name for node in nodes if isinstance(node, ast.Global | ast.Nonlocal) for name in node.names}
+        terms = {
+            name: assignments
+            for name, assignments in notes.definitions.list_assigned(function).items()
+            if name.isidentifier() and TERM_WORDS & {*split_name(name)}
+        }
+        if read & READ_BY_NAME or not read & {*terms}:
+            continue
+        for name, assignments in terms.items():
+            if name not in read and all(_is_own(one) and _is_computed(one.value) for one in assignments):
+                yield assignments[0]
+
+
+def _is_own(one: Assignment) -> bool:
+    """Say whether a variable gets a value of its own: what is unpacked among others, as from super().step(action),
+    need not be used."""
+    return one.element is None and not one.is_part
+
+
+def _is_computed(node: ast.expr) -> bool:
+    return any(isinstance(one, ast.Name | ast.Call) for one in ast.walk(node))
+
+
 def _compare(
     notes: NotedEpisodes, function: Function, name: str, assignments: Sequence[Assignment]
 ) -> Iterator[DiscardedReward]:
@@ -39,9 +73,8 @@ def _compare(
             continue
         first, last = block.index(before.statement), block.index(after.statement)
         reads = [node for one in block[first + 1 : last + 1] for node in ast.walk(one) if _reads(node, name)]
-        # What is unpacked among others, as from super().step(action), need not be used.
-        is_counted = before.element is None and notes.reward.numbers.read_constant(before.value) is None
-        if first < last and not reads and is_counted:
+        is_constant = notes.reward.numbers.read_constant(before.value) is not None
+        if first < last and not reads and _is_own(before) and not is_constant:
             yield DiscardedReward(before, after)
 
 

@@ -94,6 +94,8 @@ def _read_index(node: ast.expr) -> int | None:
     match node.slice:
         case ast.Constant(value=int(number)):
             return number
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int(number))):
+            return -number
         case ast.Tuple(elts=[ast.Slice() | ast.Name(id="worlds"), ast.Constant(value=int(number)), *_]):
             return number
     return None

@@ -44,6 +44,7 @@ NO_DISPLAY = re.compile(
 """What X11, PyBullet, GLFW, pygame, Qt, Tk and pyglet print where there is no display."""
 _NO_FILE = re.compile(r"Error opening file '([^']+)'|^File (.+) does not exist$")
 """What MuJoCo's ValueError says, and the OSError of Gymnasium's MujocoEnv."""
+_MODELS = {".xml", ".mjcf", ".mjb", ".urdf"}  # other files are named in these
 _MODEL = re.compile(r"[^\n]+\.(urdf|sdf|xml|mjcf|obj|stl|dae|vtk|png|jpg|bullet)", re.IGNORECASE)
 
 
@@ -107,6 +108,8 @@ def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
             name = str(cause.filename or (path[0] if path else message))
         elif match := _NO_FILE.search(message):
             name = match[1] or match[2]
+            if Path(name).suffix.lower() not in _MODELS:
+                folders = ["the folder of the model, or that of its meshdir or texturedir"]
         elif type(cause).__module__ == "pybullet" and "load" in message.lower():
             name, data = _find_model(cause.__traceback__), sys.modules.get("pybullet_data")
             folders += [data.getDataPath()] if data else []

@@ -2,7 +2,8 @@
 and attributes that are set under conditions which episodes of a check hardly ever meet."""
 
 import ast
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Iterator, Sequence, Set
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from rlctl.checking.experiments.expressions import NotedEpisodes
 from rlctl.checking.expressions import NotedCall, Value
 from rlctl.checking.goal_draws import Branch, GoalDraws
 from rlctl.checking.source_code import FaultyCode, Function, write_code
+from rlctl.environments.bullet_calls import record_calls
 
 RESETS = {"reset", "reset_model", "reset_idx", "_reset"}
 REMOVED = {
@@ -71,11 +73,20 @@ class LeftOvers:
                 continue
             for node in ast.walk(function):
                 removing = REMOVED.get(read_name(node.func)) if isinstance(node, ast.Call) else None
-                if isinstance(node, ast.Call) and removing and not removing & called:
+                if isinstance(node, ast.Call) and removing and not removing & (called | self._called_by_a_reset):
                     removal = min(removing - {"resetSimulation", "disconnect"})
                     what = f"{read_name(node.func)} in a step, and no reset calls {removal}: what an episode has"
                     what += " made is still there in the next one"
                     yield FaultyCode(node, what, self.source.find_place(node))
+
+    @functools.cached_property
+    def _called_by_a_reset(self) -> Set[str]:
+        """The functions of PyBullet that a reset calls, also from files of other folders, which are not read."""
+        names: set[str] = set()
+        with record_calls(()) as calls:
+            calls.after_call = lambda name, *_: names.add(name)
+            self.noted.play(0, 0, {})
+        return names
 
     def find_fields(self) -> Iterator[FaultyCode]:
         """Yield fields of MuJoCo's data that steps set under a condition, and resets never."""

@@ -40,7 +40,7 @@ class SignedCostReader:
     def find(self) -> Iterator[tuple[Summand, ReadExpression]]:
         """Yield the summand, and what it is."""
         for summand in (*self.reward.summands, *self.reward.differences):
-            if summand.weight < 0:
+            if summand.weight < 0 and not _is_beyond(summand):
                 hops = self._list_hops(summand.place)
                 if self._has_both_signs(summand.place) and self._should_be_small(summand, hops) and self._is_one(hops):
                     yield summand, hops[-1]
@@ -104,3 +104,12 @@ class SignedCostReader:
             case ast.Name() | ast.Attribute() | ast.Subscript():
                 return True
         return False
+
+
+def _is_beyond(summand: Summand) -> bool:
+    """Say whether it counts on one side of a limit only: `if roll > limit: cost += roll - limit`."""
+    compared = [node for test, _ in summand.conditions for node in ast.walk(test) if isinstance(node, ast.Compare)]
+    sides = {ast.unparse(side) for node in compared for side in (node.left, *node.comparators)}
+    parts = [node for node in ast.iter_child_nodes(summand.place.node) if isinstance(node, ast.expr)]
+    own = {*summand.names, *(ast.unparse(node) for node in (summand.place.node, *parts))}
+    return bool(own & sides)

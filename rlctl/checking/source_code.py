@@ -49,7 +49,8 @@ class FaultyCode:
 
 
 class SourceCode:
-    """The modules of an environment's author: those of its classes, and of the same folder what they have imported."""
+    """The modules of an environment's author: those of its classes, and what was imported of the same folders and of
+    the same top-level packages: rewards and robots often have folders of their own."""
 
     def __init__(self, env: Any) -> None:
         self.author = find_author(env)
@@ -111,14 +112,39 @@ class SourceCode:
 
 
 def _list_modules(env: Any) -> list[ModuleType]:
-    own = [sys.modules.get(cls.__module__) for cls in list_own_classes(find_author(env))]
-    modules = {id(module): module for module in own if module is not None and getattr(module, "__file__", None)}
-    folders = {Path(str(module.__file__)).parent for module in modules.values()}
+    classes = [sys.modules.get(cls.__module__) for cls in list_own_classes(find_author(env))]
+    own = {id(module): module for module in classes if module is not None and _find_file(module) is not None}
+    folders = {file.parent for module in own.values() if (file := _find_file(module))}
+    modules = dict(own)
     for module in list(sys.modules.values()):
-        file = getattr(module, "__file__", None)
-        if isinstance(file, str) and Path(file).parent in folders and is_own_file(file):
+        if (file := _find_file(module)) is not None and file.parent in folders and is_own_file(str(file)):
             modules.setdefault(id(module), module)
+    for module in _follow_imports(list(own.values())):
+        modules.setdefault(id(module), module)
     return list(modules.values())[:MOST_MODULES]
+
+
+def _find_file(module: ModuleType) -> Path | None:
+    file = getattr(module, "__file__", None)
+    return Path(file) if isinstance(file, str) else None
+
+
+def _follow_imports(modules: Sequence[ModuleType]) -> Iterator[ModuleType]:
+    """Yield what modules have imported, and these in turn, of the top-level packages in whose folders they are."""
+    parents = {parent for module in modules if (file := _find_file(module)) for parent in file.parents}
+    seen, waiting = {id(module) for module in modules}, list(modules)
+    while waiting:
+        for value in list(vars(waiting.pop(0)).values()):
+            name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+            module = sys.modules.get(name) if isinstance(name, str) else None
+            if module is None or id(module) in seen:
+                continue
+            seen.add(id(module))
+            package = sys.modules.get(module.__name__.partition(".")[0])
+            is_near = any(Path(folder) in parents for folder in getattr(package, "__path__", ()))
+            if is_near and (file := _find_file(module)) is not None and is_own_file(str(file)):
+                waiting.append(module)
+                yield module
 
 
 def walk_own(function: Function) -> Iterator[ast.AST]:

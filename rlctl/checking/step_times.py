@@ -92,7 +92,7 @@ def find_declared(log: AttributeLog) -> DeclaredTimes | None:
     named = {
         name: round(value)
         for name, value in log.declared.items()
-        if set(words_of(name)) & SUBSTEP_WORDS and value == round(value) and 1 < value <= MOST_SUBSTEPS
+        if set(words_of(name)) & SUBSTEP_WORDS and 1 < value <= MOST_SUBSTEPS and value == round(value)
     }
     # A module may have constants of another robot.
     counts = {name: count for name, count in named.items() if name.startswith("self.")} or named

@@ -15,6 +15,7 @@ _INSTALLED = re.compile(r"(?:site|dist)-packages/(\w+)")
 _MENTIONS = re.compile(r"\bmujoco\b|\bmj[A-Z_]", re.IGNORECASE)
 _OF_AN_API = (AssertionError, AttributeError, ImportError, KeyError, TypeError)
 """What Python raises where a library has other names or types than the code expects."""
+_OF_PYTHON = re.compile(r"'(bool|dict|float|int|list|NoneType|set|str|tuple)' object has no attribute")
 
 
 def mujoco_fix(error: BaseException) -> str:
@@ -32,7 +33,8 @@ def mujoco_fix(error: BaseException) -> str:
     version = metadata.version("mujoco")
     if others and mentions_mujoco:
         return f"{_name_distribution(others[-1])} may be written for another MuJoCo than {version}: {_advise(version)}"
-    if isinstance(error, _OF_AN_API) and frames and _MENTIONS.search(frames[-1].line or ""):
+    is_of_an_api = isinstance(error, _OF_AN_API) and _OF_PYTHON.match(read_message(error)) is None
+    if is_of_an_api and frames and _MENTIONS.search(frames[-1].line or ""):
         return f"MuJoCo {version} is installed. If this was written for another version: {_advise(version)}"
     return ""
 

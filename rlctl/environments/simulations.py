@@ -55,4 +55,5 @@ def describe_mujoco_model(env: gymnasium.Env[Any, Any]) -> str:
         limits = f" {low:.3g} to {high:.3g}" if model.jnt_limited[joint] else ""
         joints.append(f"{joint_name(model, int(joint))}{limits}")
     more = f" and {len(joints) - _SHOWN_JOINTS} more" if len(joints) > _SHOWN_JOINTS else ""
-    return f"{model.body_mass.sum():.4g} kg; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}"
+    listed = f"; joints: {', '.join(joints[:_SHOWN_JOINTS])}{more}" if joints else ""
+    return f"{model.body_mass.sum():.4g} kg{listed}"

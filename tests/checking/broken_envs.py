@@ -146,6 +146,14 @@ class RL103Rounding(Clean):
         return np.array([rounded if self.steps == 20 else 0.0, self.position[1]], np.float32)
 
 
+class RL103OftenSlightlyOutOfRange(Clean):
+    """As a joint with soft limits that is pushed against its stop."""
+
+    def observe(self):
+        pushed = 1.01 * self.size if self.steps % 5 == 3 else 0.0  # half a percent of -size..size
+        return np.array([pushed, self.position[1]], np.float32)
+
+
 class RL104NanObservation(Clean):
     def observe(self):
         return self.position * np.float32("nan" if self.steps == 11 else 1)

@@ -174,7 +174,9 @@ class RamOtherNames(Ram):
         distances = np.array([one[8] for one in points])
         normals = [one[7] for one in points]
         first_position = points[0][5] if points else (0, 0, 0)
-        return float(normal_force + sum(friction_forces) + distances.sum() + len(normals) + first_position[0])
+        lin_pos, ang_pos = p.getBasePositionAndOrientation(self.box, physicsClientId=self.cid)
+        tilt = 0.0 * (lin_pos[0] + ang_pos[0])
+        return float(tilt + normal_force + sum(friction_forces) + distances.sum() + len(normals) + first_position[0])
 
     def joint(self):
         state = p.getJointState(self.body, 0, physicsClientId=self.cid)

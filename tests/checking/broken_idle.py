@@ -92,6 +92,14 @@ class RL638SkiffShowsItsFirstGate(Skiff):
         self.way = np.array([[c, s], [-s, c]]) @ (self.gates[0] - self.place)
 
 
+class SkiffKnowsItsCourse(Skiff):
+    """What it observes of its gates is in the length of its course, from the first gate to the last."""
+
+    def look(self):
+        super().look()
+        self.way = self.way / (0.1 + np.linalg.norm(self.gates[-1] - self.gates[0]))
+
+
 class RL842SkiffWithoutCurrent(Skiff):
     def drift(self):
         return 0.0

@@ -47,6 +47,11 @@ class Renders(Clean):
         return picture
 
 
+class ResetRaises(Renders):
+    def reset(self, *, seed=None, options=None):
+        raise RuntimeError("no world")
+
+
 class RL215TakesNoMode(Clean):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
 

@@ -116,6 +116,15 @@ class NoMujocoModel(Clean):
         self.model = mujoco.MjModel.from_xml_path("finger.xml")
 
 
+class NoMujocoTexture(Clean):
+    def __init__(self):
+        import mujoco
+
+        super().__init__()
+        grass = '<texture name="grass" type="2d" file="assets/grass.png"/>'
+        mujoco.MjModel.from_xml_string(f"<mujoco><asset>{grass}</asset></mujoco>")
+
+
 class NoMujocoEnvModel(Clean):
     def __init__(self):
         from gymnasium.envs.mujoco import MujocoEnv  # optional

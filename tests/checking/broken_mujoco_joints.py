@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 from broken_turned import Cart
-from mujoco_robots import ARM, MujocoArm, MujocoHopper
+from mujoco_robots import ARM, MujocoArm, MujocoHopper, MujocoRobot
 
 # RL804
 
@@ -175,3 +175,40 @@ class RL820ArmVelocity(MujocoArm):
 class RL820ArmVelocityOfSubsteps(RL820ArmVelocity):
     def time(self):
         return self.model.opt.timestep
+
+
+# RL803: a physics that is never stepped
+
+
+class RoverByPositions(MujocoRobot):
+    """Its body reaches into the ground, and nothing pushes it out: it is placed, and contacts are only looked at."""
+
+    xml = """
+    <mujoco><option gravity="0 0 0"/><worldbody><geom name="ground" type="plane" size="9 9 1"/>
+    <body name="rover"><joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+      <geom name="hull" type="cylinder" size=".2 .05" mass="5"/></body></worldbody></mujoco>
+    """
+    joints = 2
+
+    def start(self):
+        self.data.qpos[:] = self.np_random.uniform(-1, 1, 2)
+
+    def move(self, action):
+        self.data.qpos[:] += 0.02 * action
+        self.forward()
+
+    def observe(self):
+        return self.data.qpos.copy()
+
+    def reward(self):
+        return -float(np.square(self.data.qpos).sum())
+
+    def succeeds(self):
+        return bool(np.abs(self.data.qpos).max() < 0.1)
+
+
+class RL803RoverInTheGround(RoverByPositions):
+    def move(self, action):
+        self.data.qvel[:] = action
+        mujoco.mj_step(self.model, self.data, nstep=self.frames)
+        self.forward()

@@ -175,6 +175,13 @@ class RL401RL808SharedWorld(Clean):
         self.client = -1
 
 
+class SharedWorldThatDraws(RL401RL808SharedWorld):
+    """What it draws from NumPy's generator changes nothing."""
+
+    def move(self, action):
+        super().move(action * (1 + 0.0 * np.random.rand()))  # noqa: NPY002
+
+
 class OwnWorld(RL401RL808SharedWorld):
     """The same with physicsClientId everywhere: nothing is wrong with it."""
 

@@ -364,6 +364,22 @@ class RL701ArmPullsOnly(Arm):
         return super().target(np.array([max(0.0, action[0]), *action[1:]]))
 
 
+class ArmPullsWithOneMotor(Arm):
+    """It has the same range for all joints, and one of them moves in one direction only."""
+
+    pulls, pushes = [0], []
+
+    def target(self, action):
+        way = np.array(action, float)
+        way[self.pulls] = (way * (np.abs(way) + way))[self.pulls] / 2
+        way[self.pushes] = (way * (np.abs(way) - way))[self.pushes] / 2
+        return super().target(way)
+
+
+class ArmPullsAndPushes(ArmPullsWithOneMotor):
+    pushes = [1]
+
+
 class RL701BoatForwardOnly(Boat):
     def move(self, action):
         super().move(np.maximum(action, 0.0))

@@ -141,6 +141,14 @@ class RL116BoatWithAGyroReadAsWxyz(BoatWithAGyro):
         return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+class BoatReadsItsGyroTwice(RL116BoatWithAGyroReadAsWxyz):
+    def observe(self):
+        shown = super().observe()
+        w, x, y, z = Rotation.from_euler("z", self.heading).as_quat()
+        shown[3] = w * w + x * x - y * y - z * z
+        return shown
+
+
 class HopperOfItsSoles(MujocoHopper):
     """It is paid a little for how high one sole is."""
 

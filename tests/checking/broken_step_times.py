@@ -1,5 +1,7 @@
 """Robots whose steps take another time than they declare, next to their twins."""
 
+import math
+
 import mujoco
 import numpy as np
 import pybullet as p
@@ -34,6 +36,10 @@ class CartRecordsSlowly(Cart):
 
 class HopperSteps(MujocoHopper):
     control_dt, decimation = 0.01, 5  # [s], steps of 0.002 s
+
+
+class FlyerWaitsForNoFrame(FlyerSteps):
+    frames_until_pause = math.inf
 
 
 class RL831HopperStepsTwice(HopperSteps):

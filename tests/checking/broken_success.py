@@ -90,6 +90,59 @@ class RL647BoatForgetsItsTurns(BoatTurnsSlowly):
         return float(reward)
 
 
+class BoatChargesForTurns(BoatTurnsSlowly):
+    def reward(self):
+        distance_cost = self.distance()
+        turning_cost = 0.1 * self.speed[1] ** 2
+        return -(distance_cost + turning_cost)
+
+
+class BoatForgetsToCharge(BoatTurnsSlowly):
+    def reward(self):
+        distance_cost = self.distance()
+        turning_cost = 0.1 * self.speed[1] ** 2  # noqa: F841
+        return -distance_cost
+
+
+class BoatTellsOfItsTurns(BoatTurnsSlowly):
+    """What it pays for its turns is not in its reward, and read."""
+
+    def reward(self):
+        distance_cost = self.distance()
+        turning_cost = 0.1 * self.speed[1] ** 2
+        lost_bonus = 0.0  # noqa: F841
+        self.told = f"{turning_cost:.3f}"
+        return -distance_cost
+
+
+class BoatOwesUntilItIsNear(BoatTurnsSlowly):
+    def reward(self):
+        return min(0.0, 0.05 - 0.3 * self.distance())
+
+
+class BoatAlwaysOwes(BoatTurnsSlowly):
+    """Its rewards are small beside its costs, and clipped."""
+
+    def reward(self):
+        earned = 1.0 - 0.3 * self.distance()
+        return max(0.0, earned - 20.0 * abs(self.heading - 9.0))
+
+
+class BoatKeepsToItsLane(BoatTurnsSlowly):
+    """It pays for what is beyond its lane, to either side."""
+
+    def reward(self):
+        return -self.distance() - self.lane_penalty(self.place[1])
+
+    def lane_penalty(self, offset):
+        penalty = 0.0
+        if offset > 0.2:
+            penalty += (offset - 0.2) * 0.5
+        elif offset < -0.2:
+            penalty += (-0.2 - offset) * 0.5
+        return penalty
+
+
 class BoatSpares(BoatTurnsSlowly):
     def reward(self):
         effort = np.sum(np.square(self.taken))

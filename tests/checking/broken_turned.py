@@ -91,6 +91,14 @@ class RL123FlyerNorth(North, Flyer): ...
 class RL123CartNorth(North, Cart): ...
 
 
+class CartNorthOnlyPlaced(RL123CartNorth):
+    """Its reset writes positions, and the engine computes nothing before the first step."""
+
+    def forward(self):
+        if self.data.time:
+            super().forward()
+
+
 class RL123HopperNorth(North, MujocoHopper): ...
 
 
@@ -114,6 +122,16 @@ class CrawlerLooks(AnyHeading, Crawler):
 class RL123CrawlerNorth(CrawlerLooks):
     def angles(self):
         return [*super().angles()[:2], 0.0]
+
+
+class CrawlerNorthOnABox(RL123CrawlerNorth):
+    """Its feet begin in the ground, which is a large box, as in PyBullet's plane.urdf."""
+
+    def load(self):
+        super().load()
+        p.removeBody(self.floor, physicsClientId=self.client)
+        box = p.createCollisionShape(p.GEOM_BOX, halfExtents=[100, 100, 5], physicsClientId=self.client)
+        self.floor = p.createMultiBody(0, box, basePosition=[0, 0, -4.95], physicsClientId=self.client)
 
 
 class Puck(AnyHeading, Robot):

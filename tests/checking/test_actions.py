@@ -123,3 +123,10 @@ def test_random_actions_are_the_samples_of_the_space(space):
 
 def test_a_gripper_that_has_nothing_to_grasp_is_an_info():
     assert found("broken_actions.py:GrasperFarAway", "RL701") == {("RL701", "info")}
+
+
+@pytest.mark.slow
+@pytest.mark.pybullet
+def test_dead_halves_at_both_ends_are_a_warning():
+    assert found("broken_robots.py:ArmPullsWithOneMotor", "RL701") == {("RL701", "info")}
+    assert found("broken_robots.py:ArmPullsAndPushes", "RL701") == {("RL701", "warning")}

@@ -1,6 +1,7 @@
 """What the expressions of a source are worth while it runs, and the times that it adds up and divides by."""
 
 import functools
+import importlib
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -175,6 +176,33 @@ def test_an_environment_of_a_library_has_no_source():
 def test_a_module_that_is_not_a_file_is_left_out(monkeypatch):
     monkeypatch.setitem(sys.modules, "nowhere", SimpleNamespace(__file__=None))
     assert {Path(file).name for file in SourceCode(Cart()).trees} >= {"test_expressions.py"}
+
+
+def test_imports_of_the_same_package_are_read(tmp_path, monkeypatch):
+    files = {
+        "beetle/__init__.py": "",
+        "beetle/envs/__init__.py": "",
+        "beetle/envs/walk.py": "import gymnasium\nimport ladybird\nfrom beetle.rewards.terms import pay\n\n"
+        "class Walk(gymnasium.Env):\n    pass\n",
+        "beetle/envs/near.py": "",
+        "beetle/rewards/__init__.py": "",
+        "beetle/rewards/terms.py": "from beetle.rewards import kernels\n\ndef pay():\n    return kernels.near(0)\n",
+        "beetle/rewards/kernels.py": "def near(error):\n    return 1 - error\n",
+        "beetle/training/__init__.py": "",  # imported by nobody who builds the environment
+        "ladybird/__init__.py": "",  # another package
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("beetle.envs.walk", "beetle.envs.near", "beetle.training"):
+        importlib.import_module(name)
+    source = SourceCode(sys.modules["beetle.envs.walk"].Walk())
+    read = {Path(file).relative_to(tmp_path).as_posix() for file in source.trees}
+    of_rewards = {"beetle/rewards/kernels.py", "beetle/rewards/terms.py"}
+    assert read == {"beetle/envs/__init__.py", "beetle/envs/near.py", "beetle/envs/walk.py", *of_rewards}
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("beetle", "ladybird")]:
+        del sys.modules[name]
 
 
 DEEP = """

@@ -144,6 +144,8 @@ SHOWN = {
         "BoatTurnsFromItself": ("RL620", "BoatTurnsSlowly"),
         "BoatLeavesItsCourse": ("RL634", "BoatKeepsCourse"),
         "RL647BoatForgetsItsTurns": ("RL647", "BoatTurnsSlowly"),
+        "BoatAlwaysOwes": ("RL602", "BoatOwesUntilItIsNear"),
+        "BoatForgetsToCharge": ("RL647", "BoatChargesForTurns"),
         "BoatSpends": ("RL621", "BoatSpares"),
         "BoatIsPaidForBeingLost": ("RL621", "BoatStopsPaying"),
         "BoatLimitsItsTurnsTheWrongWay": ("RL645", "BoatLimitsItsTurns"),
@@ -163,12 +165,13 @@ SOUND = {
     "broken_exchanged.py": ["BoatLooksBack"],
     "broken_fields.py": ["RamApart", "RamOtherNames"],
     "broken_frames.py": ["BargeTurnsInPartsOfATurn"],
+    "broken_idle.py": ["SkiffKnowsItsCourse"],
     "broken_late.py": ["CrabSteersByIt", "CrabKeepsAView", "CrabKeepsTime", "SnailRemembers", "SnailGains"],
     "broken_parts.py": ["BoatStartsItsEngine", "BoatBrakes", "BoatSaturates"],
     "broken_previous.py": ["BoatRestOfCourse"],
     "broken_seen.py": ["Scout", "LoaderOnItsHead"],
     "broken_starts.py": ["HopperOfFriction", "BoatLightsUp"],
-    "broken_success.py": ["BoatIsPaidForItsRest"],
+    "broken_success.py": ["BoatIsPaidForItsRest", "BoatKeepsToItsLane", "BoatTellsOfItsTurns"],
     "broken_unwrapped.py": ["ValveHasStops"],
 }
 """What looks like one of these mistakes, and is none."""

@@ -67,6 +67,12 @@ def test_a_library_that_is_not_installed_is_not_the_environments_fault():
     assert "library_for_pictures" in verdict.not_judged["RL215"]
 
 
+def test_a_reset_that_raises_is_no_failure_of_rendering():
+    verdict = verdict_of(f"{FILE}:ResetRaises", "RL207", "RL215")
+    assert [finding.rule for finding in verdict.findings] == ["RL207"]
+    assert "RuntimeError: no world" in verdict.not_judged["RL215"]
+
+
 def test_no_limit_is_told_with_what_is_known():
     (message,) = messages("RL506Falls", "RL506")
     assert message.startswith(

@@ -96,6 +96,9 @@ def test_a_missing_model_of_mujoco_is_named():
     assert finding.evidence["file"] == "finger.xml"
     (finding,) = findings("broken_loading.py:NoMujocoEnvModel", "RL007")
     assert finding.evidence["file"] == "/nowhere/arm.xml"
+    (finding,) = findings("broken_loading.py:NoMujocoTexture", "RL007")
+    folder = "the folder of the model, or that of its meshdir or texturedir"  # and not the current one
+    assert finding.message == f"the constructor does not find 'assets/grass.png', looked for in {folder}"
 
 
 def test_a_missing_file_is_named_without_the_words_around_it():

@@ -63,6 +63,7 @@ CASES = [
         twin="mujoco_robots.py:MujocoArm",
         slow=True,
     ),
+    broken_joints("RL803RoverInTheGround", "RL803", "RoverByPositions", slow=True),
     broken_joints("RL811ArmIncrementsInOtherOrder", "RL811", "ArmIncrements", "error", slow=True),
     broken_joints("RL811HopperIncrementsInOtherOrder", "RL811", "RL811HopperIncrements", "error", slow=True),
     broken_joints("RL816ArmIncrementsTooFar", "RL816", "ArmIncrements", slow=True),

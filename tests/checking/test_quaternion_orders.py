@@ -5,6 +5,7 @@ import ast
 import pytest
 
 from rlctl.checking.quaternion_orders import WXYZ, XYZW, read_literal, read_turned
+from tests.checking.judging import found_in_source
 
 
 @pytest.mark.parametrize(
@@ -27,3 +28,12 @@ def test_the_cosine_is_w():
     assert read_literal(parts) == WXYZ
     assert read_literal(parts[::-1]) == XYZW
     assert read_literal(parts[:3]) is None
+
+
+@pytest.mark.slow
+def test_a_second_mistake_is_named_with_its_line():
+    pytest.importorskip("mujoco")
+    finding = found_in_source("broken_starts.py:BoatReadsItsGyroTwice")["RL116"]
+    first, second = finding.evidence["places"]
+    assert first != second
+    assert finding.message.endswith(f"it is x, y, z, w (likewise {second})")

@@ -36,6 +36,7 @@ CASES = [
     case("broken_envs.py:RL103OftenOutOfRange", ("RL103", "error")),
     case("broken_envs.py:RL103LastOutOfRange", ("RL103", "info")),
     case("broken_envs.py:RL103Rounding", ("RL103", "warning")),
+    case("broken_envs.py:RL103OftenSlightlyOutOfRange", ("RL103", "warning"), slow=True),
     case("broken_envs.py:RL104NanObservation", ("RL104", "error")),
     case("broken_envs.py:RL105ReusedMemory", ("RL105", "info"), slow=True),
     case("broken_envs.py:RL106UnboundedActions", ("RL106", "error")),
@@ -258,6 +259,15 @@ def test_difference_is_named():
     assert finding.evidence["seed"] == 1000
     assert finding.evidence["element"] in finding.message
     assert finding.evidence["relative_difference"] > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.pybullet
+def test_a_shared_world_is_told_beside_a_shared_generator():
+    every = findings("broken_repeats.py:SharedWorldThatDraws", "RL401", "RL309", "RL808")
+    (finding,) = [finding for finding in every if finding.rule == "RL401"]
+    assert "both use PyBullet's client 0 (RL808), and draw from a global random generator (RL309)" in finding.message
+    assert "physicsClientId" in finding.fix
 
 
 @pytest.mark.slow

@@ -49,3 +49,9 @@ def test_finds_the_mistake_and_only_that(case):
 def test_a_robot_that_drifts_away_from_where_it_began_does_not_rest_there():
     # A part of the observation is 0, as is the place of the drone in its first steps.
     assert found(f"{SIGNS}:DroneThrottles", "RL605") == set()
+
+
+@pytest.mark.slow
+@pytest.mark.pybullet  # its file has robots of both engines
+def test_an_infinite_number_of_frames_is_no_number_of_steps():
+    assert found("broken_step_times.py:FlyerWaitsForNoFrame", "RL831", "RL832") == set()

@@ -48,6 +48,17 @@ def test_a_robot_that_always_begins_with_the_same_heading_is_an_info():
 
 
 @pytest.mark.slow
+def test_level_ground_is_known_before_the_engine_has_computed_anything():
+    assert found("broken_turned.py:CartNorthOnlyPlaced", "RL123") == {("RL123", "warning")}
+
+
+@pytest.mark.slow
+@pytest.mark.pybullet
+def test_a_large_box_is_level_ground_for_feet_that_begin_in_it():
+    assert found("broken_turned.py:CrawlerNorthOnABox", "RL123") == {("RL123", "warning")}
+
+
+@pytest.mark.slow
 def test_bumps_are_no_level_ground():
     # MuJoCo's models of tasks list which geoms touch, in pairs.
     assert found("walk-rough", "RL123") == set()

@@ -170,3 +170,9 @@ def test_other_environments_have_no_model():
 def test_check_env_describes_a_model_in_one_line(task, line):
     with closing(EnvSpec(task).make()) as env:
         assert describe_mujoco_model(env) == line
+
+
+def test_a_model_without_joints_has_its_mass():
+    drone = '<body><freejoint/><geom size="0.1" mass="0.5"/></body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{drone}</worldbody></mujoco>")
+    assert describe_mujoco_model(Held(model=model, data=mujoco.MjData(model))) == "0.5 kg"

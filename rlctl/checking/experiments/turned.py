@@ -28,7 +28,7 @@ from rlctl.task.rotations import from_axis, multiply, roll_pitch_yaw, rotate
 
 PLANE = 0  # MuJoCo's type of a geom
 UP = (0.0, 0.0, 1.0)
-ENDLESS = 1e5  # [m]; PyBullet's planes are larger
+ENDLESS = 100.0  # [m]; the box of PyBullet's plane.urdf has 200 m, and its planes are larger
 LEVEL = 0.02  # how far static bodies may be above the lowest point of a robot [m]
 Numbers = NDArray[np.float64]
 
@@ -99,6 +99,7 @@ def _can_turn(instance: Instance) -> bool:
 
 def _is_level(model: Any, data: Any) -> bool:
     """Say whether all of the world is level planes, and one robot is free."""
+    sys.modules["mujoco"].mj_kinematics(model, data)  # reset may only write qpos
     is_static = model.body_weldid == 0
     touches = (model.geom_contype | model.geom_conaffinity).astype(bool)
     touches[np.concatenate([model.pair_geom1, model.pair_geom2])] = True  # Some models list pairs instead.
@@ -127,10 +128,12 @@ def _find_free_bodies(clients: Iterable[int]) -> list[tuple[ClientCalls, int]]:
 
 
 def _is_level_plane(p: ClientCalls, body: int) -> bool:
-    """Say whether a body of PyBullet is without end, and not tilted."""
+    """Say whether a body of PyBullet is a plane or a box that goes on as far as any robot, and not tilted."""
     low, high = p.getAABB(body)
     _, orientation = p.getBasePositionAndOrientation(body)
-    return bool(high[0] - low[0] > ENDLESS and rotate(orientation, UP)[2] > 1 - 1e-9)
+    is_flat = {shape[2] for shape in p.getCollisionShapeData(body, -1)} <= {p.GEOM_PLANE, p.GEOM_BOX}
+    is_endless = min(high[0] - low[0], high[1] - low[1]) > ENDLESS
+    return bool(is_flat and is_endless and rotate(orientation, UP)[2] > 1 - 1e-9)
 
 
 def _turn(instance: Instance, angle: float, speed: float, lift: float, spin: float) -> float:

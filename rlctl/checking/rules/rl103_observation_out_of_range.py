@@ -17,8 +17,9 @@ RULE = Rule(
     Severity.ERROR,
     meaning="""
         An observation is outside the bounds of its space. Both libraries refuse it, and normalisation by these
-        bounds is wrong. A warning for float rounding, or if it is rare and not at reset; an info below half a
-        percent, or if only the last observation of an episode is outside.
+        bounds is wrong. A warning for float rounding, if it is rare and not at reset, or if nothing is outside by
+        more than 1 % of its range, as of a joint with soft limits; an info below half a percent, or if only the
+        last observation of an episode is outside.
     """,
     fix="""
         Widen the bounds of observation_space to what really occurs (infinite if there is no bound), or clip the
@@ -28,6 +29,7 @@ RULE = Rule(
 )
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
+SLIGHT = 0.01  # the same, relative to the range, up to which it is no error
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning
 
 
@@ -56,6 +58,8 @@ def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
         counts = {"observations_outside": count, "observations": total}
         evidence = trajectory.at(step, element=element, value=value, expected=[low, high], **counts)
         severity = Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside)
+        if severity is Severity.ERROR and _is_slight(leaf, recorded):
+            severity = Severity.WARNING
         yield RuleFinding(RULE, message, evidence, severity)
 
 
@@ -68,6 +72,12 @@ def _severity_of_outside(
     if share >= LARGE_SHARE or (outside & is_first).any():
         return Severity.ERROR
     return Severity.WARNING if share >= SMALL_SHARE else Severity.INFO
+
+
+def _is_slight(leaf: Leaf, recorded: list[tuple[CheckedEpisode, Series, NDArray[np.float64]]]) -> bool:
+    low, high = leaf.flat_bounds
+    largest = np.max([record[2].max(axis=0, initial=0.0) for record in recorded], axis=0)
+    return bool((largest <= SLIGHT * (high - low)).all())
 
 
 def _excess(leaf: Leaf, series: Series) -> NDArray[np.float64]:

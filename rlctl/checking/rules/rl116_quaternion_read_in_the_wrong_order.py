@@ -11,9 +11,10 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.quaternion_orders import QuaternionOrders
 from rlctl.checking.readings import NEARLY_ALL
-from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.rule import Rule, RuleFinding, Severity, list_others
 from rlctl.checking.world_logs import WorldLog
 from rlctl.checking.worlds import ANGULAR, JOINTS, ORIENTATION, VELOCITY, Array, Link, World
+from rlctl.environments.places import format_place
 
 RULE = Rule(
     "RL116",
@@ -26,8 +27,8 @@ RULE = Rule(
         it comes from, gives it to a function that expects the other, or takes the wrong element for w.
     """,
     fix="""
-        Convert once, where the quaternion is read. MuJoCo for SciPy - q[[1, 2, 3, 0]], or scalar_first=True;
-        PyBullet for a library with w first - (q[3], q[0], q[1], q[2]).
+        Convert once, where the quaternion is read. MuJoCo for SciPy - q[[1, 2, 3, 0]]; SciPy for MuJoCo -
+        q[[3, 0, 1, 2]]; or scalar_first=True. PyBullet for a library with w first - (q[3], q[0], q[1], q[2]).
     """,
 )
 
@@ -56,7 +57,11 @@ Match = tuple[int, Link, str, int, int]
 
 @judges_expressions(RULE, decides=False)
 def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
-    yield from itertools.islice(QuaternionOrders(noted).find_mistakes(RULE), 1)
+    found = list(QuaternionOrders(noted).find_mistakes(RULE))
+    for first in found[:1]:
+        places = list(dict.fromkeys(format_place(*one.where) for one in found if one.where is not None))
+        message = f"{first.message}{list_others(places)}"
+        yield RuleFinding(RULE, message, {**first.evidence, "places": places}, where=first.where)
 
 
 @judges_worlds(RULE)

@@ -37,9 +37,10 @@ def render(context: Context) -> Iterator[ChildMessage]:
     """Try the mode rgb_array, which opens no window, on an instance of its own, where it is promised."""
     with context.fresh() as instance:
         metadata = getattr(instance.env, "metadata", None)
-    modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
-    if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
-        raise NotApplicable(f"metadata does not list the render mode rgb_array (render_modes: {modes})")
+        modes = metadata.get("render_modes") if isinstance(metadata, dict) else None
+        if not isinstance(modes, (list, tuple, set)) or "rgb_array" not in modes:
+            raise NotApplicable(f"metadata does not list the render mode rgb_array (render_modes: {modes})")
+        instance.reset(FIRST_SEED)  # What fails without rendering, too, is RL207.
     try:
         with context.fresh("rgb_array") as instance:
             instance.reset(FIRST_SEED)

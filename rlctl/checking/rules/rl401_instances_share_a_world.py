@@ -8,6 +8,7 @@ from rlctl.checking.neighbours import find_failure, require_same_alone
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.rules.rl309_global_random_generator import RULE as GLOBAL_RANDOM
+from rlctl.checking.rules.rl808_physicsclientid_left_out import RULE as NO_CLIENT
 
 RULE = Rule(
     "RL401",
@@ -35,7 +36,18 @@ def find_shared_world(records: Records) -> Iterator[RuleFinding]:
         return
     for alone, beside in (("fresh process", "interleaved"), ("second alone", "interleaved second")):
         if (difference := compare(records, alone, beside)) is not None:
-            draws = any(finding.rule == GLOBAL_RANDOM.id for finding in records.findings)
-            because = ("; both draw from a global random generator (RL309)", GLOBAL_RANDOM.fix) if draws else ()
-            yield report(RULE, records, difference, f"{IN_TURNS}, compared with one alone", *because)
+            because, fix = _find_cause(records)
+            yield report(RULE, records, difference, f"{IN_TURNS}, compared with one alone", because, fix)
             return
+
+
+def _find_cause(records: Records) -> tuple[str, str]:
+    """Return what both share, as far as other rules have found it, and how to mend it."""
+    found = {finding.rule for finding in records.findings}
+    if {NO_CLIENT.id, GLOBAL_RANDOM.id} <= found:  # Either may be the cause.
+        return "; both use PyBullet's client 0 (RL808), and draw from a global random generator (RL309)", ""
+    if NO_CLIENT.id in found:
+        return "; both use PyBullet's client 0 (RL808)", ""
+    if GLOBAL_RANDOM.id in found:
+        return "; both draw from a global random generator (RL309)", GLOBAL_RANDOM.fix
+    return "", ""

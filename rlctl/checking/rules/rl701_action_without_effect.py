@@ -31,8 +31,8 @@ RULE = Rule(
         statements and never the one beside it, also of an attribute that follows the action. An error if no element
         does anything else: there is nothing to learn. An info if the reward of the own step can also rise, as in a
         bandit, if the source compares the element, as that of a gripper, or if all values in one half of the range do
-        the same; a warning where that is so for every element, or where the source clips more than a quarter of the
-        range at one end, and does not compare the element.
+        the same; a warning where that is so for every element, or in the upper half for some and in the lower one for
+        others, or where the source clips more than a quarter of the range at one end, and does not compare the element.
     """,
     fix="""
         Use every element of the action in step(), or take it out of action_space. Look for a wrong index, a
@@ -74,12 +74,12 @@ def _describe_clipped(clipped: ClippedAction) -> RuleFinding:
 def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
     trials, every = shown.trials, shown.dimensions
     effects: dict[str, Effect] = {}
-    halves: list[str] = []
+    halves: dict[str, bool] = {}  # whether it is the upper one
     why = f"only {MOST_DIMENSIONS} are compared" if len(every) > MOST_DIMENSIONS else ""
     try:
         for dimension in every[:MOST_DIMENSIONS]:
             effects[dimension.name] = _find_effect(trials, dimension)
-            halves += _find_dead_half(trials, dimension) if effects[dimension.name] == "lasting" else []
+            halves |= _find_dead_half(trials, dimension) if effects[dimension.name] == "lasting" else {}
         if "lasting" not in effects.values():
             costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
             effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
@@ -98,10 +98,12 @@ def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
         yield _finding(waiting, f"{message} it, and what follows may need a place that was not reached", Severity.INFO)
     yield from _without_effect(effects, len(every), left_out)
     if halves:
-        message = f"half of the range is dead, every value there has the same effect: {list_names(halves)}"
-        # A single motor may act in one direction only. That all do is what a clip to the wrong range leaves.
-        is_all = len(halves) == len(every) > 1
-        yield _finding(halves, message, Severity.WARNING if is_all else Severity.INFO, fix=WHOLE_RANGE)
+        message = f"half of the range is dead, every value there has the same effect: {list_names(list(halves))}"
+        # A single motor may act in one direction only. That all do is what a clip to the wrong range leaves; that some
+        # have a dead upper half and others a dead lower one, what limits of joints leave of the same range for all.
+        is_all, are_both = len(halves) == len(every) > 1, len({*halves.values()}) > 1
+        severity = Severity.WARNING if is_all or are_both else Severity.INFO
+        yield _finding(list(halves), message, severity, fix=WHOLE_RANGE)
 
 
 def _list_switches(env: Any) -> set[str]:
@@ -136,7 +138,7 @@ def _find_effect(trials: Trials, dimension: ActionNumber) -> Effect:
     return "lasting" if effect == "reward" and _lasts(trials, dimension) else effect
 
 
-def _find_dead_half(trials: Trials, dimension: ActionNumber) -> list[str]:
+def _find_dead_half(trials: Trials, dimension: ActionNumber) -> dict[str, bool]:
     low, high = dimension.ends
 
     def is_same(one: float, two: float, before: float | None = None) -> bool:
@@ -147,8 +149,8 @@ def _find_dead_half(trials: Trials, dimension: ActionNumber) -> list[str]:
         is_dead = is_same(end, middle) and is_same(end, (end + middle) / 2)
         # An action that changes what is at its limit already, as a closed valve, acts after the other end.
         if is_dead and not is_same(other, (other + middle) / 2) and is_same(end, middle, before=other):
-            return [f"{dimension.name} from {min(end, middle):g} to {max(end, middle):g}"]
-    return []
+            return {f"{dimension.name} from {min(end, middle):g} to {max(end, middle):g}": end > middle}
+    return {}
 
 
 def _lasts(trials: Trials, dimension: ActionNumber) -> bool:

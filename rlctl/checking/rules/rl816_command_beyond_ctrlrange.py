@@ -38,7 +38,10 @@ RULE = Rule(
 )
 
 OUTSIDE, FEWEST_TARGETS = 0.75, 30  # part of the targets that a joint cannot reach, and how many are looked at
-TURN = "Turn its sign, or shift it: the target has to lie between the joint's limits, in the direction of its own axis."
+TURN = (
+    "Turn its sign, shift or scale it: the target has to lie between the joint's limits, in the direction of its own "
+    "axis."
+)
 BulletJoint = tuple[int, int, int]
 """Client, body and joint."""
 LONGEST_HOLD, TURNED = 200, 30  # steps of one action, and then of its opposite

@@ -83,4 +83,5 @@ def _list_times(declared: Mapping[str, float]) -> dict[str, float]:
 
 def _is_count(name: str, value: float) -> bool:
     words = set(words_of(name))
-    return value == round(value) and 1 <= value <= MOST and bool(words & COUNT_WORDS) and not words & OTHER_WORDS
+    is_whole = 1 <= value <= MOST and value == round(value)  # not infinite
+    return is_whole and bool(words & COUNT_WORDS) and not words & OTHER_WORDS
