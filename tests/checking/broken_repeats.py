@@ -23,6 +23,15 @@ class RL302NoisyStep(Clean):
         super().move(action + np.float32(0.001 * random.randint(0, 9)))
 
 
+class NoisyByItsOwnGenerator(Clean):
+    def __init__(self):
+        super().__init__()
+        self.own = np.random.default_rng()
+
+    def move(self, action):
+        super().move(action + np.float32(0.001 * self.own.standard_normal()))
+
+
 class RL303LeakyReset(Clean):
     """Keeps the wind of an episode that did not come to its end."""
 

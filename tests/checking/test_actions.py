@@ -88,7 +88,7 @@ def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
 
 
 def test_what_is_not_repeatable_is_not_judged():
-    verdict = verdict_of("broken_repeats.py:RL302NoisyStep", "RL701")
+    verdict = verdict_of("broken_repeats.py:NoisyByItsOwnGenerator", "RL701")
     assert verdict.not_judged["RL701"] == "equal seeds and actions give unequal episodes (RL3)"
 
 
