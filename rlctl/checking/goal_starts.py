@@ -120,12 +120,18 @@ class GoalStarts:
     def find_first_draws(self) -> Iterator[FaultyCode]:
         """Yield goals that only the first reset draws, as long as the environment lasts."""
         for _, assignments in self._list_goals():
-            for one in assignments:
+            drawn = [one for one in assignments if is_drawn(self.definitions, one.value, one.function)]
+            if any(self._is_of_later_reset(one.value) for one in drawn):
+                continue  # a draw again, where the first was too near to something
+            for one in drawn:
                 draw = self._find_draw(one)
                 draws: list[ast.AST] = [node for node in ast.walk(draw) if is_draw(node)]
-                is_first = self._is_of_first_reset([one.value]) or self._is_of_first_reset(draws)
-                if is_first and is_drawn(self.definitions, one.value, one.function):
+                if self._is_of_first_reset([one.value]) or self._is_of_first_reset(draws):
                     yield self._make(one.statement, "only the first reset draws this goal, and later ones keep it")
+
+    def _is_of_later_reset(self, node: ast.AST) -> bool:
+        found = self.source.find(node)
+        return found is not None and any(found.number in call.values for call in self.resets[1:])
 
     def _is_of_first_reset(self, nodes: Sequence[ast.AST]) -> bool:
         """Say whether the first reset evaluates some of these expressions, and no later one does."""

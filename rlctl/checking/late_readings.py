@@ -169,6 +169,8 @@ class LateReadings:
         """Return steps in which the value is computed once, before the robot is moved, and other than in the next
         one."""
         own = self._list_own_moves(one)
+        if any(value.node in ast.walk(self.noted.source.expressions[number].node) for number in own):
+            return []  # it is what the robot is moved to
         moves, is_copied = own or self._moves, bool(own) and not self._reads_engine(one)
         found: list[_Pair] = []
         for episode in self.noted.episodes:

@@ -6,7 +6,7 @@ import numpy as np
 
 from rlctl.checking.drawn_goals import Numbers
 from rlctl.checking.experiments.goals import judges_goals
-from rlctl.checking.goal_episodes import GoalEpisode, GoalStep, GoalTrials
+from rlctl.checking.goal_episodes import ROUNDING, GoalEpisode, GoalStep, GoalTrials
 from rlctl.checking.records import FIRST_SEED, ChildMessage, Skipped
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 
@@ -55,10 +55,21 @@ def _move_to_and_fro(trials: GoalTrials) -> Iterator[ChildMessage]:
         if _play(trials, [near] * len(one)) != one:
             yield Skipped(RULE.id, "equal seeds and actions give unequal episodes (RL3)")
             return
+        if _moves_the_robot(trials, near, near + way):
+            continue
         gain, length, name = float(gains.mean()), float(np.linalg.norm(way)), trials.drawn.name
         message = f"the reward is {gain:.3g} more each time {name} moves by {length:.3g} and back; it should be 0"
         yield RuleFinding(RULE, message, {"element": name, "seed": FIRST_SEED, "value": gain, "expected": 0.0})
         return
+
+
+def _moves_the_robot(trials: GoalTrials, near: Numbers, far: Numbers) -> bool:
+    """Say whether the robot ends elsewhere: what is drawn is no goal then, but a force, or a current."""
+    alone, moved = (GoalEpisode(trials, FIRST_SEED) for _ in range(2))
+    alone.play([near] * (WARM_UP + 2 * LOOPS))
+    seen = alone.observed
+    moved.play([near] * WARM_UP + [far, near] * LOOPS)
+    return not np.allclose(moved.observed, seen, rtol=0.0, atol=ROUNDING)
 
 
 def _play(trials: GoalTrials, goals: Sequence[Numbers]) -> list[GoalStep]:
