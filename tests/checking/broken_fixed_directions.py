@@ -50,6 +50,7 @@ class SatelliteOfMatrix(Satellite):
     noise = 0.0
 
     def start(self):
+        vars(self).pop("matrix", None)
         super().start()
         self.matrix = self.rotation().inv().as_matrix()
         del self.attitude

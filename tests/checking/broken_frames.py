@@ -16,6 +16,7 @@ def turn(vector, angle):
 class Barge(Robot):
     """Its bow has to come to a berth; the wind blows from anywhere, it has no compass, and its motors are slow."""
 
+    rlctl_ignore = {"RL110": "it hardly ever gets to the barrel"}
     joints = 3
 
     def size(self):

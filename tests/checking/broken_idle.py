@@ -11,6 +11,7 @@ MASS = 1.0
 class Skiff(Robot):
     """It passes three gates in a current, and gusts turn it now and then."""
 
+    rlctl_ignore = {"RL611": "chance does not take it through three gates"}
     every = 25  # [steps] from gust to gust
     course = None
 
@@ -68,6 +69,8 @@ class Skiff(Robot):
 
 
 class RL815SkiffLooksOnce(Skiff):
+    rlctl_ignore = {"RL611": "a consequence", "RL114": "a consequence"}
+
     def move(self, action):
         self.advance(action)
         if self.gate < 2 and self.distance() < 0.2:

@@ -118,7 +118,7 @@ class CrankPoints(Pusher):
 
 
 class RL626CrankOtherLink(CrankPoints):
-    rlctl_ignore = {**CrankPoints.rlctl_ignore, "RL611": "a consequence"}
+    rlctl_ignore = {**CrankPoints.rlctl_ignore, "RL611": "a consequence", "RL619": "a consequence"}
     judged = 1
 
 

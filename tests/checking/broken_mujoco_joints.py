@@ -11,7 +11,7 @@ from mujoco_robots import ARM, MujocoArm, MujocoHopper, MujocoRobot
 class RL804ArmLimitsInRadians(MujocoArm):
     """Its compiler reads degrees."""
 
-    rlctl_ignore = dict.fromkeys(("RL701", "RL611"), "a consequence")
+    rlctl_ignore = dict.fromkeys(("RL701", "RL611", "RL619", "RL816"), "a consequence")
     xml = ARM.replace("-60 150", "-1.05 2.62").replace("-20 140", "-0.35 2.44").replace("-170 170", "-2.97 2.97")
 
 

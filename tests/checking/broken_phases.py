@@ -110,7 +110,8 @@ class ArmPhases(Phases, MujocoArm):
         return False
 
 
-class RL638ArmPaidForTheFirst(FirstIsPaid, ArmPhases): ...
+class RL638ArmPaidForTheFirst(FirstIsPaid, ArmPhases):
+    rlctl_ignore = {"RL611": "it never ends", "RL619": "its second goal may be out of reach"}
 
 
 class FromTheStart:

@@ -148,6 +148,7 @@ class PaysSuccess:
 class CostsSuccess(PaysSuccess):
     """The bonus has the sign of a penalty."""
 
+    rlctl_ignore = {"RL605": "a consequence"}
     bonus = -5.0
 
 

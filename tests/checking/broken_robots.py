@@ -67,6 +67,11 @@ class RL117BoatWraps(Boat):
 
 
 class RL117CrawlerWraps(Crawler):
+    rlctl_ignore = {
+        "RL303": "contacts are not reset to the last bit",
+        "RL123": "it observes no heading",
+    }
+
     def angles(self):
         self.turn = 0.0 if self.steps == 0 else self.turn + 0.3
         return [*super().angles()[:2], np.arctan2(np.sin(self.turn), np.cos(self.turn))]
@@ -425,6 +430,7 @@ class ArmDriven(ArmHeldByMotors):
 
 
 class RL821CrawlerHeldByMotors(TorqueDriven, Crawler):
+    rlctl_ignore = {"RL303": "contacts are not reset to the last bit", "RL706": "a consequence"}
     torque = 0.5  # [N m]
 
 

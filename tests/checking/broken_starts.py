@@ -100,6 +100,8 @@ class BoatToItsAim(Boat):
 
 
 class RL610BoatFloatsAtItsAim(BoatToItsAim):
+    rlctl_ignore = {"RL504": "a consequence"}
+
     def start(self):
         super().start()
         self.target = self.place.copy()

@@ -76,7 +76,8 @@ class RL630RoverTellsSigns(Signed, RoverTells): ...
 class RL630ArmTellsSigns(Signed, ArmTells): ...
 
 
-class RL630ReacherTellsSigns(Signed, ReacherTells): ...
+class RL630ReacherTellsSigns(Signed, ReacherTells):
+    rlctl_ignore = {"RL611": "a consequence"}
 
 
 class Forgets:

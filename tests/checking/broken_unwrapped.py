@@ -24,6 +24,8 @@ class BoatPoints(Boat):
 
 
 class RL618BoatPointsTheLongWay(BoatPoints):
+    rlctl_ignore = {"RL605": "it is paid for pointing there as well"}
+
     def off_course(self):
         return abs(self.bearing() - self.heading)
 

@@ -107,4 +107,4 @@ def _describe(misfit: Misfit, place: str, velocity: str) -> RuleFinding:
     else:
         what = f"{place} or {velocity} is turned by {turn} in the wrong direction: the length of {place} changes by the"
         message = f"{what} velocity only if that is turned by twice the angle"
-    return RuleFinding(RULE, message, {"element": velocity, "value": place})
+    return RuleFinding(RULE, message, {"element": velocity, "value": place}, same=("RL124", "RL125"))
