@@ -5,7 +5,7 @@ import functools
 import random
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -100,6 +100,14 @@ def _grow_further(context: Context, known: float) -> float:
     return context.growth / known
 
 
+def _skip(
+    experiment: Experiment, with_finding: Collection[str], why: str, *, applies: bool = True
+) -> Iterator[Skipped]:
+    for name in (*experiment.rules, experiment.name):
+        if name not in with_finding:
+            yield Skipped(name, why, applies=applies)
+
+
 def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
     started = time.monotonic()
     context.progress.phase(experiment.name)
@@ -114,12 +122,13 @@ def _run(experiment: Experiment, context: Context) -> Iterator[ChildMessage]:
             yield message
     except (NotJudged, NotApplicable, RecursionError) as reason:  # of the environment's calls it is `EnvironmentRaised`
         why = TOO_DEEP if isinstance(reason, RecursionError) else str(reason)
-        for name in (*experiment.rules, experiment.name):
-            if name not in with_finding:
-                yield Skipped(name, why, applies=not isinstance(reason, NotApplicable))
+        yield from _skip(experiment, with_finding, why, applies=not isinstance(reason, NotApplicable))
     except EnvironmentRaised as error:
-        is_complete = False
-        yield describe_failure(error, context.progress)
+        if experiment.alters:
+            yield from _skip(experiment, with_finding, f"{error.call} raised in a state that the check made: {error}")
+        else:
+            is_complete = False
+            yield describe_failure(error, context.progress)
     except UsageError:
         raise
     except Exception as error:  # what calls of the environment raise was caught at the call

@@ -38,6 +38,7 @@ class Experiment:
     own_rules: tuple[str, ...]
     hooks: tuple[JudgeHook[Any], ...]
     seeds_globals: bool = False  # see `Context.seeds_globals`
+    alters: bool = False  # it changes attributes or the engine's state: what then raises is no failure of its own
 
     @property
     def rules(self) -> tuple[str, ...]:
@@ -95,14 +96,17 @@ def experiment(
     share: float = 1.0,
     hooks: tuple[JudgeHook[Any], ...] = (),
     seeds_globals: bool = False,
+    alters: bool = False,
 ) -> Callable[[RunExperiment], Experiment]:
     """Make an experiment of a function. If it completes it decides `rules`, and those that register with its hooks.
 
-    With `seeds_globals` it compares episodes also of an environment that draws from global generators (RL309).
+    With `seeds_globals` it compares episodes also of an environment that draws from global generators (RL309). One that
+    `alters` the environment's state judges nothing where a call raises.
     """
 
     def make(run: RunExperiment) -> Experiment:
-        return Experiment(name, process, place, share, run, tuple(rule.id for rule in rules), hooks, seeds_globals)
+        own = tuple(rule.id for rule in rules)
+        return Experiment(name, process, place, share, run, own, hooks, seeds_globals, alters)
 
     return make
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, mark_slow
+from tests.checking.judging import case, check_case, mark_slow, verdict_of
 
 pytest.importorskip("mujoco")
 
@@ -25,3 +25,11 @@ CASES = [
 @pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
 def test_finds_the_mistake_and_only_that(case):
     check_case(case)
+
+
+def test_what_raises_where_the_check_moved_an_attribute_is_no_failure():
+    verdict = verdict_of("broken_fixed_directions.py:SatelliteOfMatrix", "RL129", "RL207")
+    assert verdict.findings == []
+    assert verdict.not_judged["RL129"].startswith(
+        "step raised in a state that the check made: ValueError: Non-positive"
+    )

@@ -78,7 +78,7 @@ judges_commands = JudgeHook[CommandTrials]()
 """Shows an instance whose commands can be changed."""
 
 
-@experiment("commands", PROBE, 111, share=0.3, hooks=(judges_commands,), seeds_globals=True)
+@experiment("commands", PROBE, 111, share=0.3, hooks=(judges_commands,), seeds_globals=True, alters=True)
 def change_commands(context: Context) -> Iterator[ChildMessage]:
     """Change each number of each command alone."""
     instance = context.instance

@@ -58,7 +58,7 @@ judges_goals = JudgeHook[GoalTrials]()
 """Shows an instance with a goal that can be moved."""
 
 
-@experiment("goals", PROBE, 110, share=0.5, hooks=(judges_goals,), seeds_globals=True)
+@experiment("goals", PROBE, 110, share=0.5, hooks=(judges_goals,), seeds_globals=True, alters=True)
 def find_goals(context: Context) -> Iterator[ChildMessage]:
     """Find an attribute that is drawn at reset and stays, and the parts of the observation that follow it."""
     instance = context.instance

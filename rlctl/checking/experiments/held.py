@@ -47,7 +47,7 @@ class HeldEpisode:
         return self.ended == "steps" and not np.ptp(self.rewards[SETTLED:]).any()
 
 
-@experiment("held", PROBE, 105, share=0.5, seeds_globals=True)
+@experiment("held", PROBE, 105, share=0.5, seeds_globals=True, alters=True)
 def hold_robot(context: Context) -> Iterator[ChildMessage]:
     """Play a few episodes, each with another seed, in which the engine is put back before each step."""
     instance = context.instance

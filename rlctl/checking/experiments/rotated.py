@@ -63,7 +63,7 @@ judges_rotated = JudgeHook[RotatedRobot]()
 """Shows a robot whose world turns with it."""
 
 
-@experiment("rotated", PROBE, 115, share=0.4, hooks=(judges_rotated,), seeds_globals=True)
+@experiment("rotated", PROBE, 115, share=0.4, hooks=(judges_rotated,), seeds_globals=True, alters=True)
 def rotate_world(context: Context) -> Iterator[ChildMessage]:
     """Find which attributes turn with the world of a robot, and let the rules look at what it observes then."""
     instance = context.instance

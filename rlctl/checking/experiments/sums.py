@@ -140,7 +140,7 @@ judges_sums = JudgeHook[FoundSums]()
 """Shows an instance of which something adds up the actions."""
 
 
-@experiment("sums", PROBE, 113, share=0.3, hooks=(judges_sums,), seeds_globals=True)
+@experiment("sums", PROBE, 113, share=0.3, hooks=(judges_sums,), seeds_globals=True, alters=True)
 def find_action_sums(context: Context) -> Iterator[ChildMessage]:
     """Play some random steps, and find what adds up a number of the action."""
     instance = context.instance

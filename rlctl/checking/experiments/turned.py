@@ -77,7 +77,7 @@ judges_turned = JudgeHook[TurnedRobot]()
 """Shows a robot on level ground that the parts turn."""
 
 
-@experiment("turned", PROBE, 112, share=0.5, hooks=(judges_turned,), seeds_globals=True)
+@experiment("turned", PROBE, 112, share=0.5, hooks=(judges_turned,), seeds_globals=True, alters=True)
 def turn_robot(context: Context) -> Iterator[ChildMessage]:
     """Find a free robot on level ground, and let the rules turn it."""
     instance = context.instance

@@ -34,7 +34,7 @@ REGRESSED_RESETS = 60  # Resets over which an attribute is predicted from the ob
 SHOWN = 0.9  # part of an attribute's variance that the observation has to explain
 
 
-@experiment("hidden state", INSTANCES, 70, RULE, FROM_START, share=1.5, seeds_globals=True)
+@experiment("hidden state", INSTANCES, 70, RULE, FROM_START, share=1.5, seeds_globals=True, alters=True)
 def change_attributes(context: Context) -> Iterator[ChildMessage]:
     """Play one episode again and again, each time with one attribute as reset drew it for another seed."""
     with context.fresh() as instance:

@@ -52,7 +52,7 @@ class _Pose:
     joints: Array  # positions, then velocities; shape (2, joints)
 
 
-@experiment("mirror", INSTANCES, 40, RULE, seeds_globals=True)
+@experiment("mirror", INSTANCES, 40, RULE, seeds_globals=True, alters=True)
 def compare_mirror_images(context: Context) -> Iterator[ChildMessage]:
     """Take steps from random states in flight, and the mirrored steps from their mirror images."""
     env = context.instance.env

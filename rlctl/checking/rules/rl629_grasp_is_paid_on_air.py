@@ -39,7 +39,7 @@ MOVED = 0.01  # of an object [m]
 MOST_DIMENSIONS = 9
 
 
-@experiment("grasps", PROBE, 108, RULE, share=0.3, seeds_globals=True)
+@experiment("grasps", PROBE, 108, RULE, share=0.3, seeds_globals=True, alters=True)
 def close_on_air(context: Context) -> Iterator[ChildMessage]:
     """Close and open the gripper away from the object."""
     instance = context.instance

@@ -72,7 +72,7 @@ class _Goal:
         attribute.assign(shape_like(attribute.value, numbers))
 
 
-@experiment("other goals", INSTANCES, 71, RULE)
+@experiment("other goals", INSTANCES, 71, RULE, alters=True)
 def exchange_goals(context: Context) -> Iterator[ChildMessage]:
     """Play one episode again and again, each time with one of its goals as reset drew it for another seed."""
     with context.fresh() as instance:
