@@ -277,7 +277,7 @@ def _apply(rule: str, records: Records, verdict: CheckVerdict) -> None:
 def _findings(rule: str, records: Records, earlier: set[str]) -> list[RuleFinding]:
     """Return the findings of a rule but those whose mistake is shown by another rule already: by an experiment, or by
     one of the `earlier` rules; those by expressions of the source only where it has found nothing else but infos."""
-    found: set[str] = {finding.rule for finding in records.findings}
+    found: set[str] = {finding.rule for finding in records.findings if rule not in finding.same}
     by_expressions: list[RuleFinding] = records.facts.get(BY_EXPRESSIONS, [])
     of_source = [one for one in by_expressions if one.rule == rule and not found & set(one.same)]
     try:

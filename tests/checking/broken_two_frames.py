@@ -13,12 +13,7 @@ class AirshipInWorld(Airship):
         return self.goal - self.place
 
 
-class RL127AirshipGoal(Airship):
-    rlctl_ignore = {
-        **Airship.rlctl_ignore,
-        "RL129": "turned with the world, the way to the goal alone shows it as well",
-    }
-
+class RL125AirshipGoal(Airship):
     def seen_goal(self):
         return self.turn(self.goal - self.place, self.yaw)
 

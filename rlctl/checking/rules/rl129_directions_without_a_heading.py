@@ -92,7 +92,7 @@ def _describe_doubles(robot: RotatedRobot, turnings: Sequence[Turning]) -> Itera
     if len(columns) > 1:
         message = f"{list_names([names[column] for column in columns])} turn twice as far as the world does: they are"
         message += f" turned by the heading of the robot, {robot.heading_name}, in the wrong direction"
-        yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, same=("RL124",))
+        yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, same=("RL124", "RL125"))
 
 
 def _are_varied(turnings: Sequence[Turning]) -> bool:

@@ -77,7 +77,7 @@ def _find_signed_errors(notes: NotedEpisodes) -> Iterator[ChildMessage]:
         message += " square or an absolute value"
         if values.size:
             message += f" ({text} was {values.min():.3g} to {values.max():.3g})"
-        yield RuleFinding(RULE, message, {"element": name}, where=notes.reward.locate(error.place))
+        yield RuleFinding(RULE, message, {"element": name}, where=notes.reward.locate(error.place), same=("RL622",))
         return
     for summand, place in reader.find_growing():
         values, text = notes.reward.numbers.list_values(place.node), ast.unparse(place.node)
