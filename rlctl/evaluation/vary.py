@@ -115,7 +115,7 @@ def _find_other_engine(spec: EnvSpec, policy: LoadedPolicy | Baseline, request: 
     """Return the engine of a measurement; no choice where it is the policy's own, or that of the task's recipe."""
     if policy.info is None:
         return request.changes.sim
-    own = policy.info.derive_spec()
+    own = policy.info.spec.replace_missing_engine()
     return Engine() if spec.sim == own.sim else spec.sim
 
 

@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from rlctl import output
 from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.registry import find_origin
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.importing.sb3_model import SavedModel, read_model, read_normalization
@@ -64,6 +65,7 @@ def import_model(
         spec=spec,
         training_steps=model.training_steps,
         versions={**collect_versions(), "stable-baselines3": model.version},
+        origin=find_origin(spec.task),
     )
     try:
         # All arguments of the network, because SB3's defaults may change.

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 import sys
@@ -6,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rlctl.environments.registry import find_origin
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
 from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
@@ -16,6 +18,7 @@ from rlctl.evaluation.junit import make_group_suite, make_suite
 from rlctl.evaluation.report import as_json
 from rlctl.launching.train import run_training
 from rlctl.play.messages import EpisodeResult
+from rlctl.policy.file import PolicyFile
 from rlctl.runs.tables import read_table
 from rlctl.runs.train_request import TrainRequest
 from rlctl.task.pybullet.library import is_installed
@@ -95,6 +98,23 @@ def test_an_episode_does_not_depend_on_what_runs_beside_it(reach_run, evaluation
 @pytest.mark.slow
 def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
     assert {row["overlap"] for row in read_table(reach_run.evals_file)} == {0.0}  # the arm touches nothing
+
+
+def test_a_policy_of_a_package_that_is_not_installed_names_it(reach_run, rlctl, tmp_path):
+    trained = PolicyFile.read(reach_run.best_policy)
+    assert trained.info.origin == find_origin("reach")
+    file = tmp_path / "given.safetensors"
+    spec = dataclasses.replace(trained.info.spec, task="segbot")
+    trained.with_info(spec=spec, origin={"distribution": "segbot", "version": "0.1.0"}).write(file)
+    assert rlctl("eval", file).stderr == (
+        "error: this policy was trained on the task 'segbot' of the package segbot 0.1.0, which is not installed\n"
+        "install segbot 0.1.0 from its folder or wheel: pip install PATH; installed tasks: rlctl tasks\n"
+    )
+    other = EvalRequest(str(file), task="reach", episodes=1)
+    assert run_evaluation(other).spec.task == "reach"
+    trained.with_info(spec=spec, origin={}).write(file)  # of an older version
+    with pytest.raises(UsageError, match=r"'segbot', which is not installed\ninstall its package from its folder"):
+        run_evaluation(EvalRequest(str(file), episodes=1))
 
 
 def test_terms_add_up_to_the_return(evaluation):
