@@ -84,7 +84,8 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
         of_package = f" of the package {package}" if package else ""
         raise UsageError(
             f"this policy was trained on the task {task!r}{of_package}, which is not installed\n"
-            f"install {package or 'its package'} from its folder or wheel: pip install PATH; installed tasks: rlctl tasks"
+            f"install {package or 'its package'} from its folder or wheel: pip install PATH; what is installed: "
+            "rlctl tasks"
         )
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:

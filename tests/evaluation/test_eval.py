@@ -108,7 +108,7 @@ def test_a_policy_of_a_package_that_is_not_installed_names_it(reach_run, rlctl, 
     trained.with_info(spec=spec, origin={"distribution": "segbot", "version": "0.1.0"}).write(file)
     assert rlctl("eval", file).stderr == (
         "error: this policy was trained on the task 'segbot' of the package segbot 0.1.0, which is not installed\n"
-        "install segbot 0.1.0 from its folder or wheel: pip install PATH; installed tasks: rlctl tasks\n"
+        "install segbot 0.1.0 from its folder or wheel: pip install PATH; what is installed: rlctl tasks\n"
     )
     other = EvalRequest(str(file), task="reach", episodes=1)
     assert run_evaluation(other).spec.task == "reach"
@@ -214,6 +214,32 @@ def test_a_gate_on_success_needs_success(tmp_path):
     seed = SeedScore(0, score=measure_score(EvalRequest(str(run.path), episodes=2)))
     with pytest.raises(UsageError, match="--min-success: this task reports no success"):
         GroupScore(None, [seed]).check(Gates(min_success_lower=0.5))
+
+
+SILENT = """
+    import gymnasium, numpy as np
+
+    class Silent(gymnasium.Env):
+        observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            with open("resets", "a") as file:
+                file.write("reset\\n")
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(1, np.float32), 0.0, True, False, {}
+"""
+
+
+def test_a_gate_on_success_is_refused_after_the_first_episode_without_it(write_module, rlctl, tmp_path):
+    write_module("silent.py", SILENT)
+    command = ("eval", "silent.py:Silent", "--policy", "zero", "--episodes", "300", "--n-envs", "1")
+    refused = rlctl(*command, "--min-success", "0.9", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "--min-success: this task reports no success" in refused.stderr
+    assert len((tmp_path / "resets").read_text().splitlines()) < 5
 
 
 def test_command_line_gate_and_pure_json(rlctl, reach_run, tmp_path):
