@@ -78,8 +78,13 @@ def summarize(results: Sequence[EpisodeResult]) -> Outcome:
         success_rate=success_rate(results),
         success_interval=success_interval(results),
         mean_return=mean_return(results),
-        return_interval=mean_interval([result.total_reward for result in results]),
+        return_interval=return_interval(results),
     )
+
+
+def return_interval(results: Sequence[EpisodeResult]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean return."""
+    return mean_interval([result.total_reward for result in results])
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float]:

@@ -53,6 +53,8 @@ class Evaluation:
     failure_patterns: list[FailurePattern] = dataclasses.field(default_factory=list)  # what failures have in common
     planned: int = 0  # episodes that were to be played
     early: EarlyGate | None = None  # what may have ended it before
+    return_interval: tuple[float, float] | None = None
+    """95 % interval of the mean return; None for one episode, and where the results may have ended it early."""
 
     def check(self, gates: Gates) -> None:
         """Raise `AnswerIsNo`, naming every gate that was missed."""
@@ -235,6 +237,7 @@ def _summarize(
         failure_patterns=find_patterns(episodes, workers.info),
         planned=request.episodes,
         early=early,
+        return_interval=None if early is not None or len(results) < 2 else episode_statistics.return_interval(results),
     )
 
 
@@ -255,7 +258,7 @@ def measure_score(
         episodes=len(results),
         seed=evaluation.seed,
         mean_return=evaluation.returns.mean,
-        return_interval=episode_statistics.mean_interval([result.total_reward for result in results]),
+        return_interval=episode_statistics.return_interval(results),
         success=evaluation.success_rate,
         success_interval=evaluation.success_interval,
         mean_length=evaluation.lengths.mean,

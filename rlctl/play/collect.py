@@ -67,8 +67,9 @@ def play_episodes(
 
     Each worker plays in its first environment, or in all worlds of a `BatchTask`. An episode depends on its seed and
     the policy only, not on the worker. With `taught` the workers' teacher acts instead of the policy.
-    `watch` is called with the number of finished episodes, several times a second, and `check` with each episode's
-    result as soon as it has ended; if one of them raises, the caller must close the workers. Raises `TaskError` if an environment fails, and for an episode that does not end.
+    `watch` is called with the number of finished episodes, several times a second, and `check` with the result of each
+    episode as soon as it has ended; if one of them raises, the caller must close the workers. Raises `TaskError` if an
+    environment fails, and for an episode that does not end.
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms

@@ -124,6 +124,16 @@ def test_terms_add_up_to_the_return(evaluation):
     assert evaluation.final_distance.min > 0
 
 
+def test_the_mean_return_has_an_interval(evaluation, reach_run, rlctl):
+    returns = [episode.result.total_reward for episode in evaluation.played]
+    # Student's t of 5 degrees of freedom: 97.5 % lie below 2.570582.
+    half = 2.570582 * np.std(returns, ddof=1) / math.sqrt(6)
+    low, high = np.mean(returns) - half, np.mean(returns) + half
+    assert as_json(evaluation)["return_interval"] == [pytest.approx(low), pytest.approx(high)]
+    shown = f"mean return {np.mean(returns):.4g}  (95 % interval {low:.4g} to {high:.4g})"
+    assert shown in rlctl("eval", reach_run.path, "--episodes", "6").stdout.splitlines()
+
+
 def test_json_has_what_ci_needs(evaluation):
     content = as_json(evaluation)
     assert content["sim"] == ("pybullet" if is_installed() else "mujoco")
