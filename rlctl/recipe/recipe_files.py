@@ -12,8 +12,15 @@ from rlctl.errors import ArtifactError, RecipeError, check_name
 
 def read(path: Path) -> dict[str, Any]:
     """Read a recipe file as plain data, unchecked."""
+    presets = list_presets()
     if not path.exists():
-        raise ArtifactError(f"no recipe file {path}; presets: {', '.join(list_presets())}")
+        meant = [preset for preset in presets if preset.lower() == f"{registry.PRESETS.name}/{path.stem}".lower()]
+        close = f" Did you mean {meant[0]!r}?" if meant else ""
+        raise ArtifactError(f"no recipe file {path}.{close} Presets: {', '.join(presets)}")
+    if path.is_dir():
+        inside = sorted(path.glob("*.yaml"))  # `recipe.yaml` of a run
+        hint = f"in it is {inside[0]}" if inside else "there is no .yaml file in it"
+        raise ArtifactError(f"{path}: a folder, not a recipe; {hint}")
     from rlctl.storage import yaml_text  # most environments have no recipe
 
     content = yaml_text.load(yaml_text.read_text(path), str(path))
