@@ -1,5 +1,6 @@
 """Recipe files as plain data, unchecked, and what is known from them without pydantic's models, which load slowly."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,20 @@ def read(path: Path) -> dict[str, Any]:
 def list_presets() -> dict[str, Path]:
     """Return the presets of `--config`: name (`presets/ppo`) and file."""
     return {f"{registry.PRESETS.name}/{file.stem}": file for file in sorted(registry.PRESETS.glob("*.yaml"))}
+
+
+def read_comment(file: Path) -> str:
+    """Return the comment at the beginning of a recipe file as one text."""
+    lines = itertools.takewhile(lambda line: line.startswith("# "), file.read_text(encoding="utf-8").splitlines())
+    return " ".join(line[2:] for line in lines)
+
+
+def describe_own_preset(task: str) -> str:
+    """Return name and comment of the preset that a Gymnasium id has as its recipe; empty for any other task."""
+    file = registry.find_recipe_file(task)
+    if file is None or file.parent != registry.PRESETS:
+        return ""
+    return f"recipe {registry.PRESETS.name}/{file.stem}: {read_comment(file)}"
 
 
 def find_config(config: Path) -> Path:

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from rlctl.environments.registry import PRESETS
+from rlctl.runs.train_request import TrainRequest
+from rlctl.training.start import find_start
 
 DOCS = Path(__file__).parents[2] / "docs"
 TABLE_ROW = re.compile(r"\| `(\S+)-v5` \| ([\d,]+) \| ([\d,]+) to ([\d,]+) \| ([\d,]+) \| (\d+) \| `(\S+)` \|")
@@ -49,3 +51,12 @@ def test_what_is_promised_was_measured(row):
     assert comment_steps == steps
     comment_minutes = 120 if comment_time == "two hours" else read_number(comment_time.split()[0])
     assert 0.7 * min(took) <= comment_minutes <= 1.4 * max(took)
+
+
+def test_a_training_by_a_preset_begins_with_what_to_expect(tmp_path):
+    start = find_start(TrainRequest("Hopper-v4", root=tmp_path))
+    (note,) = start.notes
+    assert note.startswith("recipe presets/hopper-v5: For Hopper-v5: XQC ")
+    assert "after 200,000 steps and 80 minutes, measured on Hopper-v4" in note
+    other = find_start(TrainRequest("Hopper-v4", settings={"algo": "sac"}, root=tmp_path))
+    assert not any("80 minutes" in line for line in other.notes)
