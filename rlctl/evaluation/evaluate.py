@@ -179,13 +179,14 @@ def _play_seeds(
     workers: Workers, request: EvalRequest, gates: Gates, seeds: Sequence[int], show: Callable[[int], None]
 ) -> list[Episode]:
     """Play an episode per seed; raises `UsageError` at the end of the first one without the success of a gate."""
-
-    def check(result: EpisodeResult) -> None:
-        gates.check_possible(result.success is not None)
-
-    exploration = Exploration(stochastic=not request.deterministic)
-    record = request.measure_actions or request.record is not None
-    return play_episodes(workers, seeds, exploration, record=record, watch=show, check=check)
+    return play_episodes(
+        workers,
+        seeds,
+        Exploration(stochastic=not request.deterministic),
+        record=request.measure_actions or request.record is not None,
+        watch=show,
+        check=lambda result: gates.check_possible(result.success is not None),
+    )
 
 
 def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates, early: EarlyGate) -> list[Episode]:
