@@ -6,11 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from rlctl.environments.registry import find_origin
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.evaluation.episode_statistics import Spread, mean_interval, mean_terms, success_interval, success_rate
 from rlctl.evaluation.eval_request import EvalRequest, Gates
 from rlctl.evaluation.evaluate import measure_score, run_evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
@@ -122,6 +123,13 @@ def test_terms_add_up_to_the_return(evaluation):
         assert sum(episode.result.terms.values()) == pytest.approx(episode.result.total_reward)
     assert evaluation.final_distance is not None
     assert evaluation.final_distance.min > 0
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 30, 100, 1001, 20_000])
+def test_the_interval_of_a_mean_is_students(count):
+    values = np.random.default_rng(0).normal(3.0, 2.0, count)
+    expected = scipy.stats.t.interval(0.95, count - 1, values.mean(), scipy.stats.sem(values))
+    assert mean_interval(values) == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_mean_return_has_an_interval(evaluation, reach_run, rlctl):

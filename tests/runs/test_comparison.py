@@ -144,22 +144,22 @@ def test_a_copy_of_a_run_is_no_second_seed(root, tmp_path):
         compare([str(first), str(second)], EvalRequest(None, episodes=1))
 
 
-@pytest.mark.slow
 def test_the_verdict_names_a_training_that_has_not_finished(root, tmp_path):
     done, other = sorted((root / "0.9/Line").iterdir())
     stopped = RunDirectory(tmp_path / other.name)
     shutil.copytree(other, stopped.path, symlinks=True)
     stopped.write_status({"status": "interrupted"})
     steps, total = stopped.status()["steps"], stopped.recipe().total_timesteps
-    result = compare([str(done), str(stopped)], EvalRequest(None, episodes=3))
+    result = compare([str(done), str(stopped.path)], EvalRequest(None, episodes=3))
     (candidate,) = result.candidates
     place = f"stopped at step {steps:,} of {total:,}"
     assert describe_verdict(result, candidate) == f"{candidate.verdict}, but its training {place}"
     assert as_json(result)["candidates"][0]["runs"][0]["unfinished"] == place
-    exchanged = compare([str(stopped), str(done)], EvalRequest(None, episodes=3))
+    exchanged = compare([str(stopped.path), str(done)], EvalRequest(None, episodes=3))
     assert describe_verdict(exchanged, exchanged.candidates[0]).endswith(f", but the baseline's training {place}")
 
 
+@pytest.mark.slow
 def test_seeds_that_have_not_finished_are_not_compared(root, monkeypatch):
     unfinished = sorted((root / "0.99/Line").iterdir())[1]
     status = RunDirectory.status
