@@ -2,9 +2,6 @@
 
 import pytest
 
-from rlctl.runs.directory import RunDirectory
-from rlctl.runs.lookup import describe_source_change
-
 SOURCE = """
 import gymnasium as gym
 import numpy as np
@@ -49,11 +46,3 @@ def test_a_rewritten_reward_is_noticed(rlctl, changed_run, write_module):
     assert is_changed in done.stderr
     assert "--force compares anyway" in done.stderr
     assert rlctl("runs", "compare", old, new, "--episodes", 2, "--force").returncode == 0
-
-
-def test_a_task_that_is_not_installed_is_not_called_changed(write_run):
-    run = RunDirectory(write_run("segbot/2026-01-01_00-00-00_s0"))
-    run.write_status({"task": "segbot", "source_sha256": "0" * 64})
-    assert describe_source_change(run) is None
-    run.write_status({"task": "reach"})
-    assert "has changed since the run began" in describe_source_change(run)
