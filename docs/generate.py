@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import json
 import pathlib
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from typing import Any
 from rlctl.recipe.hyperparameters import ALGORITHM_PARAMETERS
 from rlctl.recipe.network_parameters import NETWORK_PARAMETERS
 from rlctl.recipe.recipe import ALGORITHMS, SCHEMA_FILE, build_schema
-from rlctl.recipe.recipe_files import list_presets
+from rlctl.recipe.recipe_files import list_presets, read_comment
 from rlctl.storage import validation, yaml_text
 from rlctl.storage.validation import Schema
 
@@ -95,8 +94,7 @@ def render_recipe_page() -> str:
 def _render_presets() -> Iterator[str]:
     """Yield a line for each preset, with the first sentence of its file's comment."""
     for name, file in list_presets().items():
-        comment = itertools.takewhile(lambda line: line.startswith("# "), file.read_text().splitlines())
-        yield f"- `{name}`: {' '.join(line[2:] for line in comment).partition('. ')[0].rstrip('.')}."
+        yield f"- `{name}`: {read_comment(file).partition('. ')[0].rstrip('.')}."
 
 
 def _render_table(root: Schema, path: Path) -> list[str]:

@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import importlib
+import importlib.util
 import re
 import shlex
 import traceback
@@ -10,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from rlctl.missing_packages import advise
+from rlctl.missing_packages import advise, name_package
 
 _LONGEST = 400  # [characters] of another library's message
 _MOST_FRAMES = 40  # of a plugin's traceback: an endless recursion has a thousand
@@ -195,11 +196,21 @@ def _is_plugin_file(file: str) -> bool:
 def did_you_mean(word: str, options: Iterable[str], otherwise: str = "") -> str:
     """Return " Did you mean 'reach'?" for the option closest to `word`, else an empty string.
 
-    With `otherwise`, what is meant where no option is nearly the same.
+    An option that differs in case only, or whose initials are the word (`lr`: `learning_rate`), is the closest. With
+    `otherwise`, what is meant where no option is nearly the same.
     """
-    close = difflib.get_close_matches(word, list(options), n=1, cutoff=0.7 if otherwise else 0.5)
+    options = list(options)
+    same = [option for option in options if option.lower() == word.lower()]
+    same += [option for option in options if "_" in option and _take_initials(option) == word]
+    if same:
+        return f" Did you mean {same[0]!r}?"
+    close = difflib.get_close_matches(word, options, n=1, cutoff=0.7 if otherwise else 0.5)
     close = close or [otherwise] * bool(otherwise)
     return f" Did you mean {close[0]!r}?" if close else ""
+
+
+def _take_initials(name: str) -> str:
+    return "".join(part[:1] for part in name.split("_"))
 
 
 def check_name(
@@ -225,14 +236,25 @@ def explain_missing_package(user: str, missing: str | None, extra: str) -> str:
 
 
 def explain_left_out(module: str | None) -> str | None:
-    """Return what to do about a module that rlctl imports and `rlctl-core` leaves out; None if `rlctl` is installed."""
-    if _read_requirements("rlctl-core") is None or _read_requirements("rlctl") is not None:
-        return None
+    """Return what to do about a missing module that rlctl imports; None for one that it does not require.
+
+    `rlctl-core` leaves some out; what `rlctl` requires may have been removed later, or never installed.
+    """
     needed = (module or "").partition(".")[0]
-    extra = re.compile(rf"""{re.escape(needed)}\b.*;.*extra == ['"](\w+)['"]""")
-    extras = [match[1] for line in _read_requirements("rlctl-core") or [] if (match := extra.match(line))]
-    package = shlex.quote(f"rlctl-core[{extras[0]}]") if extras else "rlctl"
-    return f"this needs {needed}, which is not part of rlctl-core: pip install {package}"
+    core, complete = _read_requirements("rlctl-core"), _read_requirements("rlctl")
+    if complete is None and core is not None:
+        extra = re.compile(rf"""{re.escape(needed)}\b.*;.*extra == ['"](\w+)['"]""")
+        extras = [match[1] for line in core if (match := extra.match(line))]
+        package = shlex.quote(f"rlctl-core[{extras[0]}]") if extras else "rlctl"
+        return f"this needs {needed}, which is not part of rlctl-core: pip install {package}"
+    if not needed or importlib.util.find_spec(needed) is not None:
+        return None  # a module in an installed package
+    named = re.compile(rf"{re.escape(name_package(needed))}(?![\w.-])", re.IGNORECASE)
+    required = [line.partition(";")[0] for line in (*(complete or ()), *(core or ())) if "extra ==" not in line]
+    missing = next((line.strip() for line in required if named.match(line)), None)
+    if missing is None:
+        return None
+    return f"this needs {needed}, which is not installed here: pip install {shlex.quote(missing)}"
 
 
 def _read_requirements(distribution: str) -> list[str] | None:

@@ -35,6 +35,7 @@ _PACKAGES = {
     "pybullet_utils": "pybullet",
     "pylab": "matplotlib",
     "quaternion": "numpy-quaternion",
+    "rerun": "rerun-sdk",
     "robot_descriptions": "robot-descriptions",
     "rsl_rl": "rsl-rl-lib",
     "ruamel": "ruamel.yaml",
@@ -84,6 +85,12 @@ def advise_on(module: str, importer: str = "") -> str:
     if replaced := _REPLACED.get(importer) or _REPLACED.get(package):
         return f"; {replaced}"
     return f"; pip install {shlex.quote(_PACKAGES[package])}" if package in _PACKAGES else ""
+
+
+def name_package(module: str) -> str:
+    """Return the name by which pip knows a module's package."""
+    package = module.partition(".")[0]
+    return _PACKAGES.get(package, package)
 
 
 def split(message: str, error: BaseException | None) -> tuple[str, str]:

@@ -1,11 +1,14 @@
 """What to install for a module that is missing, wherever it is imported."""
 
+import os
+import re
 import sys
+from pathlib import Path
 
 import pytest
 
 from rlctl.environments.spec import EnvSpec
-from rlctl.errors import TaskError, UsageError, describe_exception
+from rlctl.errors import TaskError, UsageError, describe_exception, explain_left_out
 from rlctl.missing_packages import advise, advise_on
 
 ENV = """
@@ -87,3 +90,14 @@ def test_check_env_gives_it_as_the_fix(rlctl, write_module):
     done = rlctl("check-env", "old.py:E").stdout
     assert "RL008" in done
     assert "fix: gym is the old Gymnasium: write `import gymnasium as gym`" in done
+
+
+def test_a_requirement_of_rlctl_that_is_missing_is_named(installed_rlctl, monkeypatch):
+    monkeypatch.setenv("HIDE_PACKAGES", "rerun")
+    folders = [str(Path(__file__).parent / "hidden"), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(folders))
+    done = installed_rlctl("replay", "reach", "--policy", "zero")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.search(r"^error: this needs rerun, which is not installed here: pip install '?rerun-sdk", done.stderr)
+    assert explain_left_out("rerun.nothing") is None  # it is installed here
+    assert explain_left_out("no_module_of_rlctl") is None

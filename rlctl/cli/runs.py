@@ -220,7 +220,9 @@ def import_run(
         ),
     ],
     task: Annotated[str | None, Option(f"The task it was trained on. {TASK_FORMS}", metavar="TASK")] = None,
-    vecnormalize: Annotated[Path | None, Option("Its normalisation, if it has one.", metavar="FILE.pkl")] = None,
+    vecnormalize: Annotated[
+        Path | None, Option("Its normalisation; none: it has none, although one is near it.", metavar="FILE.pkl|none")
+    ] = None,
     algo: Annotated[str | None, Option("Its algorithm, if the file does not name it.")] = None,
     foreign: ForeignFiles = NO_FILES,
     settings: Settings = [],
@@ -242,11 +244,11 @@ def import_run(
             "give the task that the model was trained on, --task TASK; "
             "or of a policy of another project --deploy FILE --model ROBOT"
         )
-    from rlctl.importing.import_model import find_normalizations, import_model, show
+    from rlctl.importing.import_model import choose_normalization, import_model, show
 
-    changes = parse_changes(settings)
-    policy = import_model(file, task, normalization=vecnormalize, algo=algo, output=output, changes=changes)
-    show(policy, json, find_normalizations(file) if vecnormalize is None else [])
+    changes, normalization = parse_changes(settings), choose_normalization(file, vecnormalize)
+    policy = import_model(file, task, normalization=normalization, algo=algo, output=output, changes=changes)
+    show(policy, json)
 
 
 def _import_foreign(

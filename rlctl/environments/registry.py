@@ -91,6 +91,11 @@ def is_gymnasium_id(task: str) -> bool:
     return installed.find(task) is None and _GYMNASIUM_ID.match(task) is not None
 
 
+def is_missing(task: str) -> bool:
+    """Return whether a name has the form of an installed task and none is installed with it."""
+    return ":" not in task and not (installed.find(task) or is_gymnasium_id(task) or _is_registered(task))
+
+
 def find_recipe_file(task: str) -> Path | None:
     """Return the recipe that comes with a task: `<name>.yaml` next to its module, or `<file>.yaml` next to its file.
 

@@ -20,10 +20,12 @@ def suggest(task: str) -> str:
 
 def suggest_name(task: str, installed_names: Sequence[str]) -> str:
     """Return ". Did you mean 'half-cheetah' or 'HalfCheetah-v5'?" for the closest installed name, and the newest id of
-    Gymnasium that only lacks its version; empty if there is none."""
+    Gymnasium that only lacks its version; an id that differs in case only is the one. Empty if there is none."""
     import gymnasium
 
     specs = sorted(gymnasium.registry.values(), key=lambda spec: spec.version or 0)
+    if same := next((spec.id for spec in specs if spec.id.lower() == task.lower()), None):
+        return f". Did you mean {same!r}?"
     versions = {spec.name.lower(): spec.id for spec in specs if spec.namespace is None}
     names = difflib.get_close_matches(task, installed_names, n=1, cutoff=0.5)
     names += [versions[task.lower()]] if task.lower() in versions else []

@@ -84,7 +84,9 @@ class Gates:
     def check_possible(self, has_success: bool) -> None:
         """Raise `UsageError` for a gate on success where the environment does not report it."""
         if not has_success and (self.min_success is not None or self.min_success_lower is not None):
-            raise UsageError("--min-success: this task reports no success (no is_success); use --min-return")
+            raise UsageError(
+                "--min-success: this task reports no success at the end of an episode (no is_success); use --min-return"
+            )
 
     def check_reachable(self, episodes: int, *, decide_early: bool = False) -> None:
         """Raise `UsageError` for a lower bound that so many episodes cannot reach, even if all succeed."""

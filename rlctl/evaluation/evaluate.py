@@ -53,6 +53,8 @@ class Evaluation:
     failure_patterns: list[FailurePattern] = dataclasses.field(default_factory=list)  # what failures have in common
     planned: int = 0  # episodes that were to be played
     early: EarlyGate | None = None  # what may have ended it before
+    return_interval: tuple[float, float] | None = None
+    """95 % interval of the mean return; None for one episode, and where the results may have ended it early."""
 
     def check(self, gates: Gates) -> None:
         """Raise `AnswerIsNo`, naming every gate that was missed."""
@@ -142,16 +144,18 @@ def _evaluate(actor: LoadedPolicy | Baseline, spec: EnvSpec, request: EvalReques
             output.print_notes([f"warning: since the training {'; '.join(changes)}"])
         if workers.info.reward_weights:
             gates.check_possible(workers.info.has_success)
-        episodes = _play(workers, request) if early is None else _play_until_decided(workers, request, gates, early)
+        if early is None:
+            episodes = _play(workers, request, gates)
+        else:
+            episodes = _play_until_decided(workers, request, gates, early)
         if request.record is not None:
             for number, episode in enumerate(episodes):
                 save_episode(request.record / f"{number:06d}.npz", episode.describe(spec, workers.info, actor.name))
         evaluation = _summarize(actor, workers, request, episodes, early)
         if limits is not None:
             workers.limit_actions(limits)
-            limited = _summarize(actor, workers, request, _play(workers, request))
+            limited = _summarize(actor, workers, request, _play(workers, request, gates))
             evaluation = dataclasses.replace(limited, limited_by=request.limits, unlimited=evaluation)
-    gates.check_possible(evaluation.success_rate is not None)
     return evaluation
 
 
@@ -165,18 +169,24 @@ def _read_limits(file: Path, info: EnvInfo) -> dict[str, Any]:
     return limits.model_dump(mode="json", exclude_unset=True)
 
 
-def _play(workers: Workers, request: EvalRequest) -> list[Episode]:
+def _play(workers: Workers, request: EvalRequest, gates: Gates) -> list[Episode]:
     seeds = episode_seeds(request.seed, Stream.EVAL, request.episodes)
     with output.show_progress("evaluating", len(seeds), "episodes") as show:
-        return _play_seeds(workers, request, seeds, show)
+        return _play_seeds(workers, request, gates, seeds, show)
 
 
 def _play_seeds(
-    workers: Workers, request: EvalRequest, seeds: Sequence[int], show: Callable[[int], None]
+    workers: Workers, request: EvalRequest, gates: Gates, seeds: Sequence[int], show: Callable[[int], None]
 ) -> list[Episode]:
-    exploration = Exploration(stochastic=not request.deterministic)
-    record = request.measure_actions or request.record is not None
-    return play_episodes(workers, seeds, exploration, record=record, watch=show)
+    """Play an episode per seed; raises `UsageError` at the end of the first one without the success of a gate."""
+    return play_episodes(
+        workers,
+        seeds,
+        Exploration(stochastic=not request.deterministic),
+        record=request.measure_actions or request.record is not None,
+        watch=show,
+        check=lambda result: gates.check_possible(result.success is not None),
+    )
 
 
 def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates, early: EarlyGate) -> list[Episode]:
@@ -186,8 +196,8 @@ def _play_until_decided(workers: Workers, request: EvalRequest, gates: Gates, ea
     successes = 0
     with output.show_progress("evaluating", len(seeds), "episodes") as show:
         while chunk := seeds[len(episodes) : len(episodes) + max(_PLAYED_TOGETHER, workers.n_envs)]:
-            for episode in _play_seeds(workers, request, chunk, functools.partial(_show_more, show, len(episodes))):
-                gates.check_possible(episode.result.success is not None)
+            show_chunk = functools.partial(_show_more, show, len(episodes))
+            for episode in _play_seeds(workers, request, gates, chunk, show_chunk):
                 episodes.append(episode)
                 successes += bool(episode.result.success)
                 if early.explain_end(successes, len(episodes), len(seeds)):
@@ -228,6 +238,7 @@ def _summarize(
         failure_patterns=find_patterns(episodes, workers.info),
         planned=request.episodes,
         early=early,
+        return_interval=None if early is not None or len(results) < 2 else episode_statistics.return_interval(results),
     )
 
 
@@ -248,7 +259,7 @@ def measure_score(
         episodes=len(results),
         seed=evaluation.seed,
         mean_return=evaluation.returns.mean,
-        return_interval=episode_statistics.mean_interval([result.total_reward for result in results]),
+        return_interval=episode_statistics.return_interval(results),
         success=evaluation.success_rate,
         success_interval=evaluation.success_interval,
         mean_length=evaluation.lengths.mean,

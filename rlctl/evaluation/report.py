@@ -42,6 +42,9 @@ def show(result: Evaluation, json: str | None, gates: Gates = NO_GATES) -> None:
     if result.success_rate is not None and result.success_interval is not None:
         low, high = result.success_interval
         out.print(f"success rate {result.success_rate:.1%}  (95 % interval {low:.1%} to {high:.1%})")
+    if result.return_interval is not None:
+        interval = _format_interval(result.return_interval, ".4g")
+        out.print(f"mean return {result.returns.mean:.4g}  (95 % interval {interval})")
     if result.early is not None:
         out.print(_format_decision(result, result.early))
     for pattern in result.failure_patterns:
@@ -120,6 +123,7 @@ def as_json(result: Evaluation) -> dict[str, Any]:
         "planned_episodes": result.planned,
         "end": result.end or "all episodes were played",
         "return": result.returns,
+        "return_interval": result.return_interval,
         "length": result.lengths,
         "terms": result.terms,
         "metrics": result.metrics,

@@ -72,9 +72,10 @@ def measure_robustness(
     with CellPlayer(spec, policy, request) as player:
         start = time.monotonic()
         with output.show_progress("with nothing varied", request.episodes, "episodes") as show:
-            episodes = player.play(spec, watch=show)
+            episodes = player.play(
+                spec, watch=show, check=lambda result: gates.check_possible(result.success is not None)
+            )
         nominal = summarize(episodes)
-        gates.check_possible(nominal.success_rate is not None)
         if play_cells is None:
             _ask(cells, time.monotonic() - start, yes)
         play = player.play_cells
@@ -115,7 +116,7 @@ def _find_other_engine(spec: EnvSpec, policy: LoadedPolicy | Baseline, request: 
     """Return the engine of a measurement; no choice where it is the policy's own, or that of the task's recipe."""
     if policy.info is None:
         return request.changes.sim
-    own = policy.info.derive_spec()
+    own = policy.info.spec.replace_missing_engine()
     return Engine() if spec.sim == own.sim else spec.sim
 
 
@@ -152,15 +153,20 @@ class CellPlayer(contextlib.AbstractContextManager["CellPlayer"]):
         push: dict[str, object] | None = None,
         *,
         watch: Callable[[int], None] = lambda done: None,
+        check: Callable[[EpisodeResult], None] = lambda result: None,
     ) -> list[EpisodeResult]:
-        """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`."""
+        """Play all episodes with the events and parameters of `spec`; `push` is as in `Workers.set_events`.
+
+        `watch` and `check` are as in `play_episodes`.
+        """
         workers = self.workers
         if (spec.parameters, spec.sim) != (workers.spec.parameters, workers.spec.sim):
             workers.rebuild(spec)
             self._policy.give_to(workers)
         if self._has_events:
             workers.set_events(spec, push)
-        return [episode.result for episode in play_episodes(workers, self._seeds, self._exploration, watch=watch)]
+        episodes = play_episodes(workers, self._seeds, self._exploration, watch=watch, check=check)
+        return [episode.result for episode in episodes]
 
     def play_cells(self, specs: Sequence[EnvSpec]) -> Iterator[tuple[int, Scores]]:
         """Play all episodes in each setting; yield its index and scores."""

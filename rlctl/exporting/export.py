@@ -66,10 +66,35 @@ def _export(source: FoundPolicy, targets: list[Path], sim: Engine) -> list[Expor
             sources = [(target, write_c(policy, target.stem)) for target in targets if target.suffix == ".c"]
             torch_policy = TorchActor.load(source.file)
             _check_environment(source.file, info, workers)
-        return [
+        reports = [
             *(_export_onnx(torch_policy, workers, target, model) for target, model in models),
             *(_export_c(torch_policy, workers, target, code) for target, code in sources),
         ]
+    output.print_notes(
+        f"warning: {file} was not written now, and is of another policy than {targets[0].name}; to write both: "
+        "rlctl export with --onnx --c"
+        for file in _find_others(policy, targets)
+    )
+    return reports
+
+
+def _find_others(policy: PolicyFile, targets: list[Path]) -> list[Path]:
+    """Return the files in the other format next to exported ones that differ from an export of this policy."""
+    from rlctl.exporting.c_source import write_c
+    from rlctl.exporting.onnx_source import build
+    from rlctl.policy.onnx_policy import encode
+
+    others = []
+    for file in {target.with_suffix(suffix) for target in targets for suffix in (".onnx", ".c")} - set(targets):
+        if not file.is_file():
+            continue
+        try:
+            equal = encode(build(policy)) if file.suffix == ".onnx" else write_c(policy, file.stem).source.encode()
+        except UsageError:  # a format that cannot represent this policy
+            equal = b""
+        if file.read_bytes() != equal:
+            others.append(file)
+    return others
 
 
 def _check_environment(policy_file: Path, info: PolicyInfo, workers: Workers) -> None:

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from gymnasium import spaces
 
 from rlctl import output
 from rlctl.environments.info import EnvInfo, describe
+from rlctl.environments.registry import find_origin
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
 from rlctl.importing.sb3_model import SavedModel, read_model, read_normalization
@@ -21,6 +21,7 @@ from rlctl.recipe.recipe_files import make_spec
 from rlctl.storage import files
 from rlctl.version import collect_versions
 
+NO_NORMALIZATION = Path("none")
 _MOST_PICKLES = 20  # near a model that are read
 
 
@@ -64,6 +65,7 @@ def import_model(
         spec=spec,
         training_steps=model.training_steps,
         versions={**collect_versions(), "stable-baselines3": model.version},
+        origin=find_origin(spec.task),
     )
     try:
         # All arguments of the network, because SB3's defaults may change.
@@ -140,6 +142,24 @@ def write_checked(target: Path, source: str, policy: PolicyFile) -> None:
     files.write_with(target, write)
 
 
+def choose_normalization(file: Path, given: Path | None) -> Path | None:
+    """Return the VecNormalize that was given for a model; None for `none`, or if nothing was given and none is near it.
+
+    Raises `UsageError` if nothing was given and one is near: without its normalisation a policy acts badly, and
+    nothing in the policy file would show why.
+    """
+    if given is not None:
+        return None if given == NO_NORMALIZATION else given
+    near = find_normalizations(file)
+    if not near:
+        return None
+    options = " or ".join(f"--vecnormalize {shlex.quote(str(path))}" for path in near)
+    raise UsageError(
+        f"{file}: near it {'is' if len(near) == 1 else 'are'} {', '.join(map(str, near))} with a normalisation of "
+        f"observations\nif the model was trained with it, add {options}; otherwise --vecnormalize none"
+    )
+
+
 def find_normalizations(file: Path) -> list[Path]:
     """Return the files in a model's folder, and in those below it, that are a VecNormalize of observations."""
     found = []
@@ -150,8 +170,8 @@ def find_normalizations(file: Path) -> list[Path]:
     return found
 
 
-def show(policy: PolicyFile, json: str | None, unused: Sequence[Path] = ()) -> None:
-    """Print what was imported and the next commands, or only JSON for `-`; `unused` are normalisations near it."""
+def show(policy: PolicyFile, json: str | None) -> None:
+    """Print what was imported and the next commands, or only JSON for `-`."""
     file, info, normalizes = policy.path, policy.info, policy.info.clip_observation is not None
     content = {
         "policy": file,
@@ -167,9 +187,6 @@ def show(policy: PolicyFile, json: str | None, unused: Sequence[Path] = ()) -> N
     out = output.out()
     normalization = "with" if normalizes else "without"
     out.print(f"{file}: {info.algo}, step {info.training_steps:,}, {normalization} observation normalisation")
-    if unused and not normalizes:
-        options = " or ".join(f"--vecnormalize {shlex.quote(str(path))}" for path in unused)
-        out.print(f"if it was trained with normalised observations, import it again with {options}", soft_wrap=True)
     if info.spec.time_feature:
         out.print("it also observes the remaining fraction of the episode, rl-zoo3's time feature")
     out.print(f"next:\n  rlctl eval {file}\n  rlctl export {file} --onnx\n  rlctl replay {file}")

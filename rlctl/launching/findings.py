@@ -51,6 +51,6 @@ def warn_of_unusual_values(request: TrainRequest, recipe: Recipe) -> list[str]:
         return []
     given = find_given_parameters(request.task, request.config, request.settings)
     return [
-        f"warning: {usual_ranges.describe(setting)}"
+        f"warning: {usual_ranges.describe(setting, recipe.algo)}"
         for setting in usual_ranges.find_far_out(given, recipe.algo, recipe.n_envs)
     ]

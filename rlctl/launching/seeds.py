@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rlctl import output
@@ -79,7 +79,7 @@ def _train(
     trainings = make_trainings(group.path, str(group.request.task), len(requests), jobs)
     done = f"{len(group.seeds) - len(waiting)} done, " if len(waiting) < len(group.seeds) else ""
     state = f"{done}{trainings.describe()}" if waiting else "all done: nothing to train; to train longer, give -n"
-    output.print_notes([f"{group.path}: {output.format_count(len(group.seeds), 'seed')}, {state}"])
+    output.print_notes([f"{group.path}: {_describe(group.seeds)}, {state}"])
     calls = [
         functools.partial(trainings.train, request_of_seed, functools.partial(_print_line, seed))
         for seed, request_of_seed in requests.items()
@@ -91,12 +91,24 @@ def _train(
     return SeedsResult(score, failed)
 
 
+def _describe(seeds: Sequence[int]) -> str:
+    """Return `seed 4` or `5 seeds (0 to 4)`; `3 seeds (0, 3, 7)`."""
+    if len(seeds) == 1:
+        return f"seed {seeds[0]}"
+    is_range = list(seeds) == list(range(seeds[0], seeds[-1] + 1)) and len(seeds) > 2
+    numbers = f"{seeds[0]} to {seeds[-1]}" if is_range else ", ".join(map(str, seeds))
+    return f"{len(seeds)} seeds ({numbers})"
+
+
 def _begin(request: TrainRequest, seeds: str) -> Group:
     if request.task is None or request.resume is not None:
         raise UsageError("--seeds starts a new group: give TASK and leave out --resume")
     if "seed" in request.settings:
         raise UsageError("--seeds and --seed exclude each other")
     numbers = parse_seeds(seeds)
+    if len(numbers) == 1 and (seed := numbers[0]) > 1:
+        several = f"for {seed} seeds: --seeds 0-{seed - 1}"
+        output.print_notes([f"--seeds {seeds}: one run, with seed {seed}; {several}"])
     find_start(request)
     return create_group(request, numbers)
 

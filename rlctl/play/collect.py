@@ -61,13 +61,15 @@ def play_episodes(
     record: bool = False,
     taught: bool = False,
     watch: Callable[[int], None] = lambda done: None,
+    check: Callable[[EpisodeResult], None] = lambda result: None,
 ) -> list[Episode]:
     """Play an episode per seed with the workers' policy and return them in the order of `seeds`.
 
     Each worker plays in its first environment, or in all worlds of a `BatchTask`. An episode depends on its seed and
     the policy only, not on the worker. With `taught` the workers' teacher acts instead of the policy.
-    `watch` is called with the number of finished episodes, several times a second; if it raises, the caller must close
-    the workers. Raises `TaskError` if an environment fails, and for an episode that does not end.
+    `watch` is called with the number of finished episodes, several times a second, and `check` with the result of each
+    episode as soon as it has ended; if one of them raises, the caller must close the workers. Raises `TaskError` if an
+    environment fails, and for an episode that does not end.
     """
     steps = min(workers.info.max_steps or _SEGMENT, _SEGMENT)
     terms = record and bool(workers.info.reward_weights)  # a plain environment has no terms
@@ -108,6 +110,7 @@ def play_episodes(
                 result, recorder = ended.get(env), running[env]
                 recorder.add(workers, env, steps if result is None else result.row + 1)
                 if result is not None:
+                    check(result)
                     del running[env]
                     terminated = bool(workers.arrays.segment.terminated[env, result.row])
                     episodes[recorder.index] = Episode(result, recorder.finish(), terminated, recorder.first)

@@ -12,10 +12,11 @@ import pydantic
 from numpy.typing import NDArray
 from pydantic import Field
 
+from rlctl.environments import named_task, registry
 from rlctl.environments.info import EnvInfo
 from rlctl.environments.named_task import POLICY
 from rlctl.environments.spec import UNCHANGED, EnvChanges, EnvSpec, PolicySpec
-from rlctl.errors import ArtifactError, short_repr
+from rlctl.errors import ArtifactError, UsageError, short_repr
 from rlctl.policy.shipped import Provenance
 from rlctl.storage import files, untrusted
 
@@ -54,18 +55,38 @@ class PolicyInfo(pydantic.BaseModel, extra="forbid"):
     training_steps: int = 0
     evaluation: Score | None = None  # the score that made it the best policy of its run; None for any other policy
     versions: dict[str, str] = {}
+    origin: dict[str, str] = {}
+    """`distribution` and `version` of the installed task in which it was trained; empty for any other task."""
     provenance: Provenance | None = None  # where an exported policy comes from; None for any other policy
 
     def derive_spec(self, task: str | None = None, changes: EnvChanges = UNCHANGED) -> EnvSpec:
-        """Return the spec of the environment it was trained in, or of another task, with `changes`."""
+        """Return the spec of the environment it was trained in, or of another task, with `changes`.
+
+        Raises `UsageError` if its own task is of a package that is not installed.
+        """
         if task is not None and task != self.spec.task:
             from rlctl.recipe.recipe_files import make_spec  # few commands play another task
 
             return changes.apply(make_spec(task).observe_as(self.spec))
+        self._check_installed()
         own = self.spec.replace_missing_engine()
         # Policies of older versions may have the level of the last stage of their training.
         own = dataclasses.replace(own, level=1.0, named_by=POLICY if task is None else "")
         return changes.apply(own)
+
+    def _check_installed(self) -> None:
+        task = self.spec.task
+        if not registry.is_missing(task):
+            return
+        named_task.check_source(task, POLICY)  # the name may have been written by anyone
+        origin = self.origin or (self.provenance.origin if self.provenance is not None else {})
+        package = short_repr(" ".join(origin.values()))
+        of_package = f" of the package {package}" if package else ""
+        raise UsageError(
+            f"this policy was trained on the task {task!r}{of_package}, which is not installed\n"
+            f"install {package or 'its package'} from its folder or wheel: pip install PATH; what is installed: "
+            "rlctl tasks"
+        )
 
     def check_fits(self, env: EnvInfo, file: Path) -> None:
         """Raise `ArtifactError` if the policy in `file` was made for other spaces than `env` has."""

@@ -178,7 +178,8 @@ class Xqc(CrossQ):
     D. Palenicek et al., [XQC](https://arxiv.org/abs/2509.25174), 2025. Unlike there, the actor, the target entropy and
     the order of layers are those of CrossQ, there are no target networks, and the networks are narrower. It needs
     rewards that are divided by the standard deviation of the return, as its default `normalize` does; `v_min` and
-    `v_max` bound the values of such rewards.
+    `v_max` bound the values of such rewards. Early in a training evaluations are far below the training's return: they
+    play the averaged actor (`actor_average`), which is over 3,333 gradient steps.
     """
 
     ent_coef: _EntropyCoefficient = "auto_0.01"

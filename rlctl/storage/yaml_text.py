@@ -156,6 +156,8 @@ def load(text: str, source: str, *, foreign: bool = False) -> Any:
         problem = getattr(error, "problem", None) or str(error)
         if isinstance(error, yaml.composer.ComposerError) and error.context:
             problem = f"{error.context}, {problem}"
+        if "'\\t'" in problem:
+            problem = "a tab: indent and separate with spaces"
         raise RecipeError(f"{where}: {short_repr(problem, 200)}") from None
 
 

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from rlctl.environments.dict_spaces import split
 from rlctl.environments.info import EnvInfo
+from rlctl.environments.registry import find_origin
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import ArtifactError, DivergedError
 from rlctl.policy.file import PolicyFile, PolicyInfo
@@ -53,6 +54,7 @@ def pack(model: BaseAlgorithm, algo: str, spec: EnvSpec, env: EnvInfo) -> Policy
         spec=spec,
         training_steps=model.num_timesteps,
         versions=collect_versions(),
+        origin=find_origin(spec.task),
     )
     return PolicyFile(info, {**tensors, **write_graph(model, algo, env.spaces()[0])})
 

@@ -25,6 +25,7 @@ from rlctl.errors import ArtifactError, RecipeError, RlctlError, UsageError, exp
 from rlctl.hub import store
 from rlctl.policy import own_modules
 from rlctl.recipe.recipe import ALGORITHMS, Recipe, validate
+from rlctl.recipe.recipe_files import describe_own_preset
 from rlctl.recipe.sources import describe_other_algorithm, describe_rounding, resolve_with_stages
 from rlctl.runs import lookup
 from rlctl.runs.directory import RunDirectory, RunLock
@@ -126,6 +127,8 @@ def _find_new(request: TrainRequest, task: str) -> Start:
     if request.demos is not None and recipe.privileged is not None:
         raise RecipeError("--demos: demonstrations do not hold what only the critic sees; add --set privileged=null")
     notes = describe_other_algorithm(task, request.config, request.settings)
+    if not notes and request.config is None and (preset := describe_own_preset(task)):
+        notes.append(preset)
     if (rounding := describe_rounding(recipe)) is not None:
         notes.append(rounding)
     demos = describe_demonstrations(Path(request.demos)) if request.demos is not None else None

@@ -16,7 +16,7 @@ import rlctl
 from rlctl.environments import own_ids, registry
 from rlctl.environments.spec import EnvSpec
 from rlctl.environments.suggestions import find_only_class
-from rlctl.errors import NoDisplayError, RecipeError, TaskError, UsageError
+from rlctl.errors import NoDisplayError, RecipeError, TaskError, UsageError, did_you_mean
 
 ENV = """
     import gymnasium, numpy as np
@@ -181,7 +181,17 @@ def test_an_unknown_name_gives_the_closest():
     assert error(UsageError, "reech").startswith("no task 'reech'. Did you mean 'reach'? Installed: ")
     assert error(UsageError, "~reach").startswith("no task '~reach'. Did you mean 'reach'? Installed: ")
     assert error(UsageError, "reech").endswith("Other forms: package.module:Class, path/to/file.py:Class, Pendulum-v1.")
+    assert error(UsageError, "Hopper-V5").startswith("no task 'Hopper-V5'. Did you mean 'Hopper-v5'? Installed: ")
+    with pytest.raises(UsageError, match=r"no environment 'hopper-v5'\. Did you mean 'Hopper-v5'\?"):
+        registry.check_registered(registry.load("hopper-v5"))
     assert UsageError("").exit_code == 2
+
+
+def test_a_name_in_other_letters_and_initials_are_the_closest():
+    presets = ["presets/xqc", "presets/ppo", "presets/tqc"]
+    assert did_you_mean("presets/PPO", presets) == " Did you mean 'presets/ppo'?"
+    assert did_you_mean("lr", ["gamma", "learning_rate", "tau"]) == " Did you mean 'learning_rate'?"
+    assert did_you_mean("bs", ["gamma", "batch_size"]) == " Did you mean 'batch_size'?"
 
 
 def test_a_folder_is_named_as_one(my_env, tmp_path):

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 import sys
@@ -5,10 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.stats
 
+from rlctl.environments.registry import find_origin
 from rlctl.environments.spec import EnvChanges
 from rlctl.errors import AnswerIsNo, UsageError
-from rlctl.evaluation.episode_statistics import Spread, mean_terms, success_interval, success_rate
+from rlctl.evaluation.episode_statistics import Spread, mean_interval, mean_terms, success_interval, success_rate
 from rlctl.evaluation.eval_request import EvalRequest, Gates
 from rlctl.evaluation.evaluate import measure_score, run_evaluation
 from rlctl.evaluation.group_scores import GroupScore, SeedScore
@@ -16,6 +19,7 @@ from rlctl.evaluation.junit import make_group_suite, make_suite
 from rlctl.evaluation.report import as_json
 from rlctl.launching.train import run_training
 from rlctl.play.messages import EpisodeResult
+from rlctl.policy.file import PolicyFile
 from rlctl.runs.tables import read_table
 from rlctl.runs.train_request import TrainRequest
 from rlctl.task.pybullet.library import is_installed
@@ -97,11 +101,45 @@ def test_evaluations_of_a_training_say_how_far_bodies_overlap(reach_run):
     assert {row["overlap"] for row in read_table(reach_run.evals_file)} == {0.0}  # the arm touches nothing
 
 
+def test_a_policy_of_a_package_that_is_not_installed_names_it(reach_run, rlctl, tmp_path):
+    trained = PolicyFile.read(reach_run.best_policy)
+    assert trained.info.origin == find_origin("reach")
+    file = tmp_path / "given.safetensors"
+    spec = dataclasses.replace(trained.info.spec, task="segbot")
+    trained.with_info(spec=spec, origin={"distribution": "segbot", "version": "0.1.0"}).write(file)
+    assert rlctl("eval", file).stderr == (
+        "error: this policy was trained on the task 'segbot' of the package segbot 0.1.0, which is not installed\n"
+        "install segbot 0.1.0 from its folder or wheel: pip install PATH; what is installed: rlctl tasks\n"
+    )
+    other = EvalRequest(str(file), task="reach", episodes=1)
+    assert run_evaluation(other).spec.task == "reach"
+    trained.with_info(spec=spec, origin={}).write(file)  # of an older version
+    with pytest.raises(UsageError, match=r"'segbot', which is not installed\ninstall its package from its folder"):
+        run_evaluation(EvalRequest(str(file), episodes=1))
+
+
 def test_terms_add_up_to_the_return(evaluation):
     for episode in evaluation.played:
         assert sum(episode.result.terms.values()) == pytest.approx(episode.result.total_reward)
     assert evaluation.final_distance is not None
     assert evaluation.final_distance.min > 0
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 30, 100, 1001, 20_000])
+def test_the_interval_of_a_mean_is_students(count):
+    values = np.random.default_rng(0).normal(3.0, 2.0, count)
+    expected = scipy.stats.t.interval(0.95, count - 1, values.mean(), scipy.stats.sem(values))
+    assert mean_interval(values) == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_mean_return_has_an_interval(evaluation, reach_run, rlctl):
+    returns = [episode.result.total_reward for episode in evaluation.played]
+    # Student's t of 5 degrees of freedom: 97.5 % lie below 2.570582.
+    half = 2.570582 * np.std(returns, ddof=1) / math.sqrt(6)
+    low, high = np.mean(returns) - half, np.mean(returns) + half
+    assert as_json(evaluation)["return_interval"] == [pytest.approx(low), pytest.approx(high)]
+    shown = f"mean return {np.mean(returns):.4g}  (95 % interval {low:.4g} to {high:.4g})"
+    assert shown in rlctl("eval", reach_run.path, "--episodes", "6").stdout.splitlines()
 
 
 def test_json_has_what_ci_needs(evaluation):
@@ -194,6 +232,34 @@ def test_a_gate_on_success_needs_success(tmp_path):
     seed = SeedScore(0, score=measure_score(EvalRequest(str(run.path), episodes=2)))
     with pytest.raises(UsageError, match="--min-success: this task reports no success"):
         GroupScore(None, [seed]).check(Gates(min_success_lower=0.5))
+
+
+SILENT = """
+    import gymnasium, numpy as np
+
+    class Silent(gymnasium.Env):
+        observation_space = action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            with open("resets", "a") as file:
+                file.write("reset\\n")
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(1, np.float32), 0.0, True, False, {}
+"""
+
+
+def test_a_gate_on_success_is_refused_after_the_first_episode_without_it(write_module, rlctl, tmp_path):
+    write_module("silent.py", SILENT)
+    command = ("eval", "silent.py:Silent", "--policy", "zero", "--episodes", "300", "--n-envs", "1")
+    refused = rlctl(*command, "--min-success", "0.9", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "--min-success: this task reports no success" in refused.stderr
+    varied = rlctl(*command, "--min-success", "0.9", "--push", cwd=tmp_path)
+    assert "--min-success: this task reports no success" in varied.stderr
+    assert len((tmp_path / "resets").read_text().splitlines()) < 10
 
 
 def test_command_line_gate_and_pure_json(rlctl, reach_run, tmp_path):

@@ -1,5 +1,6 @@
 """From a policy file to a verified ONNX file, in the policy's own environment."""
 
+import dataclasses
 import json
 import shutil
 
@@ -18,6 +19,7 @@ from rlctl.play.collect import Episode
 from rlctl.play.messages import EpisodeResult
 from rlctl.play.workers import Workers
 from rlctl.policy.actor import Rows
+from rlctl.policy.file import PolicyFile
 from rlctl.policy.onnx_policy import OnnxActor
 from rlctl.policy.torch_policy import TorchActor
 
@@ -297,6 +299,21 @@ def test_command_line(rlctl, small, train, write, tmp_path):
     assert result["max_difference"] <= 1e-5
     assert result["observations"] >= 1000
     assert result["inputs"] == [{"name": "obs", "dtype": "float", "shape": ["batch", 3]}]
+
+
+@pytest.mark.slow
+def test_a_file_of_another_policy_next_to_the_exported_one_is_named(rlctl, small, train, write, tmp_path):
+    spec = small()
+    path = write(train("ppo", spec), "ppo", spec)
+    assert rlctl("export", path.name, "--c", "--onnx", cwd=tmp_path).returncode == 0
+    assert "warning" not in rlctl("export", path.name, "--onnx", cwd=tmp_path).stderr  # the C file is of this policy
+    policy = PolicyFile.read(path)
+    tensors = {name: 0.9 * values for name, values in policy.tensors.items()}
+    dataclasses.replace(policy, tensors=tensors).write(path)
+    done = rlctl("export", path.name, "--onnx", cwd=tmp_path)
+    assert done.returncode == 0
+    assert f"warning: {path.stem}.c was not written now, and is of another policy than {path.stem}.onnx" in done.stderr
+    assert "warning" not in rlctl("export", path.name, "--c", cwd=tmp_path).stderr
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from rlctl import load_policy
 from rlctl.environments.spec import EnvChanges, EnvSpec
 from rlctl.errors import ArtifactError, UsageError
-from rlctl.importing.import_model import find_normalizations, import_model
+from rlctl.importing.import_model import import_model
 from rlctl.importing.sb3_model import read_model, read_normalization
 from rlctl.policy.torch_policy import ALGORITHMS, policy_name
 
@@ -261,9 +261,23 @@ def test_other_spaces_are_refused(save):
         import_model(request["file"], "Pendulum-v1", normalization=request["normalization"], output=request["output"])
 
 
-def test_a_normalisation_near_the_model_is_found(save):
+def test_a_model_with_a_normalisation_near_it_is_not_imported_without_an_answer(save, rlctl):
+    """Without its normalisation a policy acts badly, and its file does not show why."""
     _, _, request = save("ppo")
-    folder = request["file"].parent
+    folder, model = request["file"].parent, request["file"]
     (folder / "other.pkl").write_bytes(pickle.dumps([1, 2]))
     (folder / "damaged.pkl").write_bytes(b"no pickle")
-    assert find_normalizations(request["file"]) == [folder / "vecnormalize.pkl"]
+    statistics = folder / "vecnormalize.pkl"
+    command = ["runs", "import", str(model), "--task", SMALL, "-o", str(folder / "policy.safetensors")]
+    command += ["--set", "task.observation=vector", "--set", "task.action=box"]
+    refused = rlctl(*command)
+    assert refused.returncode == 2
+    assert not (folder / "policy.safetensors").exists()
+    advice = f"--vecnormalize {statistics}"
+    assert f"add {advice}; otherwise --vecnormalize none" in refused.stderr
+    advised = rlctl(*command, *advice.split())
+    assert advised.returncode == 0, advised.stderr
+    assert "with observation normalisation" in advised.stdout
+    answered = rlctl(*command, "--vecnormalize", "none")
+    assert answered.returncode == 0, answered.stderr
+    assert "without observation normalisation" in answered.stdout

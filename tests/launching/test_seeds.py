@@ -50,6 +50,11 @@ def test_what_is_no_seeds(text, message):
     assert str(caught.value).startswith(message)
 
 
+def test_a_single_number_is_one_seed_not_so_many(rlctl):
+    done = rlctl("train", "reach", "--seeds", "4", "--from", "missing.safetensors")  # ends before any training
+    assert done.stderr.splitlines()[0] == "--seeds 4: one run, with seed 4; for 4 seeds: --seeds 0-3"
+
+
 @pytest.fixture(scope="module")
 def group(tmp_path_factory):
     """Two seeds of PPO on the line, side by side."""
@@ -117,7 +122,7 @@ def test_resume_latest_goes_on_with_the_group(group, rlctl):
     finally:
         one.write_status(before)
     assert done.returncode == 0, done.stderr
-    assert f"{group.path}: 2 seeds, 1 done, 1 at a time" in done.stderr
+    assert f"{group.path}: 2 seeds (4, 5), 1 done, 1 at a time" in done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()[-5:-3]] == ["4", "5"]
 
 

@@ -30,7 +30,7 @@ def refused(config, settings=()):
     ("content", "expected"),
     [
         ("n_envs: 1\nseed: 2\nn_envs: 3\n", ":3: key 'n_envs' is given twice"),
-        ("n_envs:\t1\n", ":1: found character '\\t' that cannot start any token"),
+        ("n_envs:\t1\n", ":1: a tab: indent and separate with spaces"),
         ("n_envs: [1\n", ":2: expected ',' or ']', but got '<stream end>'"),
         ("n_envs: 1\n---\nn_envs: 2\n", ":2: expected a single document in the stream, but found another document"),
         ("- n_envs\n", ": expected a mapping of keys to values, got a list"),

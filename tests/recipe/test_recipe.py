@@ -261,8 +261,16 @@ def test_what_is_changed_goes_over_what_was_trained_with():
 
 
 def test_a_file_that_is_none(tmp_path, config):
-    with pytest.raises(ArtifactError, match=r"^no recipe file .*/missing.yaml; presets: presets/ant-v5, "):
+    with pytest.raises(ArtifactError, match=r"^no recipe file .*/missing.yaml. Presets: presets/ant-v5, "):
         resolve("a.py:A", tmp_path / "missing.yaml", {})
+    with pytest.raises(ArtifactError, match=r"^no recipe file .*/PPO.yaml. Did you mean 'presets/ppo'\? Presets: "):
+        resolve("a.py:A", tmp_path / "PPO.yaml", {})
+    (tmp_path / "run").mkdir()
+    with pytest.raises(ArtifactError, match=r"/run: a folder, not a recipe; there is no \.yaml file in it$"):
+        resolve("a.py:A", tmp_path / "run", {})
+    (tmp_path / "run" / "recipe.yaml").touch()
+    with pytest.raises(ArtifactError, match=r"/run: a folder, not a recipe; in it is .*/run/recipe\.yaml$"):
+        resolve("a.py:A", tmp_path / "run", {})
     with pytest.raises(RecipeError, match=r"config.yaml: expected a mapping of keys to values, got a list$"):
         resolve("a.py:A", config("- algo"), {})
     assert resolve("a.py:A", config("# nothing\n"), {}).algo == "ppo"

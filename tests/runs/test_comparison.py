@@ -17,7 +17,14 @@ from rlctl.recipe.recipe import find_difference
 from rlctl.recipe.sources import resolve
 from rlctl.runs.compare.comparison import NOT_WORSE, Candidate, ComparisonGate, RunComparison, Side, compare
 from rlctl.runs.compare.margin import check_margin
-from rlctl.runs.compare.report import as_json, describe_candidate, describe_seeds, format_needed, make_suite
+from rlctl.runs.compare.report import (
+    as_json,
+    describe_candidate,
+    describe_seeds,
+    describe_verdict,
+    format_needed,
+    make_suite,
+)
 from rlctl.runs.compare.significance import MeanDifference, Verdict
 from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
@@ -135,6 +142,21 @@ def test_a_copy_of_a_run_is_no_second_seed(root, tmp_path):
         shutil.copytree(run, second / name)
     with pytest.raises(UsageError, match="copied: two of its runs have the same recipe and seed"):
         compare([str(first), str(second)], EvalRequest(None, episodes=1))
+
+
+def test_the_verdict_names_a_training_that_has_not_finished(root, tmp_path):
+    done, other = sorted((root / "0.9/Line").iterdir())
+    stopped = RunDirectory(tmp_path / other.name)
+    shutil.copytree(other, stopped.path, symlinks=True)
+    stopped.write_status({"status": "interrupted"})
+    steps, total = stopped.status()["steps"], stopped.recipe().total_timesteps
+    result = compare([str(done), str(stopped.path)], EvalRequest(None, episodes=3))
+    (candidate,) = result.candidates
+    place = f"stopped at step {steps:,} of {total:,}"
+    assert describe_verdict(result, candidate) == f"{candidate.verdict}, but its training {place}"
+    assert as_json(result)["candidates"][0]["runs"][0]["unfinished"] == place
+    exchanged = compare([str(stopped.path), str(done)], EvalRequest(None, episodes=3))
+    assert describe_verdict(exchanged, exchanged.candidates[0]).endswith(f", but the baseline's training {place}")
 
 
 @pytest.mark.slow

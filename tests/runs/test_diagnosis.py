@@ -12,7 +12,7 @@ from rlctl.environments.info import EnvInfo, space_to_json
 from rlctl.environments.spec import EnvSpec
 from rlctl.play.episode import EpisodeInfo, RecordedEpisode, save_episode
 from rlctl.policy.file import PolicyFile, PolicyInfo
-from rlctl.runs.diagnosis.findings import Grade, diagnose, format_end, list_signs
+from rlctl.runs.diagnosis.findings import Grade, diagnose, format_end, format_finding, list_signs
 from rlctl.runs.directory import RunDirectory
 
 UPDATES = 30
@@ -195,6 +195,40 @@ def test_sick_training_is_found(write_training, id, metrics, more):
     (finding,) = (each for each in diagnose(run) if each.id == id)
     assert finding.evidence
     assert finding.advice
+
+
+def test_an_averaged_actor_that_is_young_explains_low_evaluations(write_training):
+    """The average is over 1 / (1 - 0.9997) = 3,333 updates."""
+    metrics = {"return": np.linspace(20, 1000, UPDATES), "n_updates": STEPS, "success": None}
+    evaluations = {"return": np.full(len(STEPS[5::6]), 85.0)}
+    recipe = {"algo": "xqc"}  # which has an average by default
+    (finding,) = (each for each in diagnose(write_training(metrics, evaluations, recipe)) if each.id == "Q16")
+    # The last evaluation is at the last row; the median of the returns of the last three rows is that of the 29th.
+    assert (
+        f"is {np.linspace(20, 1000, UPDATES)[-2]:.4g}, the evaluation's 85, after 30,000 updates" in finding.evidence[0]
+    )
+    assert "the average is over 3,333" in finding.evidence[0]
+
+
+@pytest.mark.parametrize(
+    ("algo", "updates", "evaluated"),
+    [("crossq", STEPS, 85.0), ("xqc", 10 * STEPS, 85.0), ("xqc", STEPS, 800.0)],
+    ids=["no average", "an old average", "it follows"],
+)
+def test_other_low_evaluations_are_not_explained_by_an_average(write_training, algo, updates, evaluated):
+    metrics = {"return": np.linspace(20, 1000, UPDATES), "n_updates": updates, "success": None}
+    evaluations = {"return": np.full(len(STEPS[5::6]), evaluated)}
+    assert "Q16" not in ids(write_training(metrics, evaluations, {"algo": algo}))
+
+
+def test_advice_on_slow_updates_is_for_the_algorithm(write_training):
+    recipe = {"algo": "xqc", "algo_kwargs": {"train_freq": 4, "gradient_steps": -1, "batch_size": 256}}
+    (finding,) = diagnose(write_training({"playing": 0.1}, recipe=recipe))
+    assert (finding.id, finding.evidence[-1]) == ("Q13", "train_freq 4, gradient_steps -1")
+    text = "\n".join(format_finding(finding))
+    assert "`algo_kwargs.train_freq` 4 is one per 4 steps" in text
+    assert "epochs" not in text
+    assert "batch_size is 256: usually 32 to 1024, often 256; raise: less noise, slower updates" in text
 
 
 @pytest.mark.parametrize(
@@ -396,7 +430,7 @@ def test_every_sign_of_a_finding_exists():
 
     named = {name.removeprefix("not ") for each in _texts() for when in each["when"] for name in when}
     assert named <= set(list_signs())
-    assert {each["id"] for each in _texts()} == {f"Q{number}" for number in range(1, 16)}
+    assert {each["id"] for each in _texts()} == {f"Q{number}" for number in range(1, 17)}
 
 
 # Of PPO with a learning rate of 0.03, whose rollouts are so long that 60,000 steps are four updates.

@@ -53,7 +53,8 @@ def test_not_a_number():
         ("a: 1\nb: 2\na: 3\n", "recipe.yaml:3: key 'a' is given twice"),
         ("a:\n  b: 1\n  b: 2\n", "recipe.yaml:3: key 'b' is given twice"),
         ("a: [1\n", "recipe.yaml:2: expected ',' or ']', but got '<stream end>'"),
-        ("a:\tb: c", "recipe.yaml:1: found character '\\t' that cannot start any token"),
+        ("a:\tb: c", "recipe.yaml:1: a tab: indent and separate with spaces"),
+        ("a:\n\tb: c", "recipe.yaml:2: a tab: indent and separate with spaces"),
     ],
 )
 def test_errors_have_their_line(text, message):

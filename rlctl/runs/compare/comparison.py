@@ -24,7 +24,7 @@ from rlctl.runs.directory import RunDirectory
 from rlctl.runs.listing import find_runs_of
 from rlctl.runs.lookup import describe_source_change
 from rlctl.runs.recipe_names import name_recipes
-from rlctl.runs.summary import summarize
+from rlctl.runs.summary import RunSummary, summarize
 from rlctl.runs.tables import read_table
 
 THRESHOLD = 0.9  # the default threshold, a success rate
@@ -40,6 +40,7 @@ class EvaluatedRun:
     evaluation: Evaluation
     steps_to_threshold: int | None
     seconds_to_threshold: float | None
+    unfinished: str = ""  # where its training is, if it has not finished: `stopped at step 7,984 of 40,000`
 
     def values(self, quantity: ComparedQuantity) -> NDArray[np.float64]:
         """Return the success (0 or 1) or return of each episode, shape (episodes,); NaN where it is not reported."""
@@ -66,6 +67,11 @@ class Side:
     def has_success(self) -> bool:
         """Whether the task reports success to every run."""
         return all(run.evaluation.success_rate is not None for run in self.runs)
+
+    @property
+    def unfinished(self) -> str:
+        """Where the first of its trainings is that has not finished; empty if all have."""
+        return next((run.unfinished for run in self.runs if run.unfinished), "")
 
     @property
     def never_succeeds(self) -> bool:
@@ -312,13 +318,21 @@ def _evaluate(
         rows = read_table(run.evals_file)
         reached = next((row for row in rows if (value := row.get(column)) is not None and value >= threshold), reached)
     steps = reached.get("steps")
+    summary = None if isinstance(run, PolicyAlone) else summarize(run.path)
     return EvaluatedRun(
         path=run.path,
-        seed=None if isinstance(run, PolicyAlone) else summarize(run.path).seed,
+        seed=None if summary is None else summary.seed,
         evaluation=evaluation,
         steps_to_threshold=None if steps is None else int(steps),
         seconds_to_threshold=reached.get("seconds"),
+        unfinished="" if summary is None else _describe_unfinished(summary, run),
     )
+
+
+def _describe_unfinished(summary: RunSummary, run: RunDirectory) -> str:
+    if summary.state == "done":
+        return ""
+    return f"{summary.state} at step {summary.steps or 0:,} of {run.recipe().total_timesteps:,}"
 
 
 def _default_threshold(threshold: float | None, has_success: bool) -> float | None:

@@ -21,7 +21,7 @@ def make_suite(result: RunComparison, gate: ComparisonGate | None, seconds: floa
     for candidate in result.candidates:
         name = candidate.side.name
         problems = [missed[name]] if name in missed else []
-        text = "\n".join([str(candidate.verdict), *describe_candidate(result, candidate)])
+        text = "\n".join([describe_verdict(result, candidate), *describe_candidate(result, candidate)])
         classname = f"{result.task}.runs compare"
         cases.append(make_gate_case(classname, f"{name} against {result.baseline.name}", problems, text))
     return Suite(f"rlctl runs compare {result.task}", seconds, cases)
@@ -47,7 +47,7 @@ def show(result: RunComparison, json: str | None, gate: ComparisonGate | None = 
     out.print(describe_tests(result))
     for candidate in result.candidates:
         question = f"\n{candidate.side.label} against {result.baseline.label}: "
-        out.print(Text.assemble(question, (candidate.verdict, "bold")))
+        out.print(Text.assemble(question, (describe_verdict(result, candidate), "bold")), soft_wrap=True)
         lines = describe_candidate(result, candidate)
         for key, (value, before) in (candidate.recipe_changes or {}).items():
             lines.append(f"recipe: {key}: {format_value(key, before)} -> {format_value(key, value)}")
@@ -96,6 +96,15 @@ def _format_aggregate(side: Side, quantity: significance.ComparedQuantity) -> st
     form = ".1%" if quantity == "success" else ".4g"
     mean, middle, low, high = (format(value, form) for value in (spread.mean, spread.iqm, *interval))
     return f"{quantity} mean {mean}, IQM {middle} ({what} {low} to {high})"
+
+
+def describe_verdict(result: RunComparison, candidate: Candidate) -> str:
+    """Return `worse, but its training stopped at step 7,984 of 40,000`; the verdict alone if both have finished."""
+    unfinished = [
+        (whose, side.unfinished) for whose, side in (("its", candidate.side), ("the baseline's", result.baseline))
+    ]
+    parts = [f"{whose} training {text}" for whose, text in unfinished if text]
+    return f"{candidate.verdict}, but {' and '.join(parts)}" if parts else str(candidate.verdict)
 
 
 def describe_candidate(result: RunComparison, candidate: Candidate) -> list[str]:
@@ -192,6 +201,7 @@ def _side_as_json(side: Side, result: RunComparison) -> dict[str, Any]:
             "return": run.evaluation.returns.mean,
             "steps_to_threshold": run.steps_to_threshold,
             "seconds_to_threshold": run.seconds_to_threshold,
+            "unfinished": run.unfinished,
         }
         for run in side.runs
     ]

@@ -1,4 +1,4 @@
-"""Findings of a training, from its run folder: Q1 to Q15, each with its evidence and what to try.
+"""Findings of a training, from its run folder: Q1 to Q16, each with its evidence and what to try.
 
 A single sign proves little: in a perfect training of `reach`, three of four updates have `approx_kl > 0.03`. So a
 finding is a combination of signs; `findings.yaml` has the combinations and all texts.
@@ -32,7 +32,7 @@ class Grade(enum.StrEnum):
 class Finding:
     """A problem that the records of a training show."""
 
-    id: str  # Q1 to Q15
+    id: str  # Q1 to Q16
     name: str
     grade: Grade
     evidence: list[str]  # the numbers that show it

@@ -12,6 +12,8 @@ from rlctl.runs.diagnosis import usual_ranges
 from rlctl.runs.diagnosis.history import FEW_ROWS, LEAST_ROWS, Curve, RunHistory
 
 _USUAL_RATE = 1e-3  # the most that is usual
+_YOUNG = 10  # lengths of an average: until then it is behind weights that change fast
+_FAR_BELOW = 0.5  # of the range of the training's returns
 _MOST_NORMALIZED_REWARD = 10.0  # where SB3's `VecNormalize` clips
 
 
@@ -81,7 +83,7 @@ def learning_rate_is_far_above(run: RunHistory) -> str | None:
 
 def setting_is_far_out(run: RunHistory) -> str | None:
     """A hyperparameter is far out of its usual range."""
-    return "; ".join(usual_ranges.describe(setting) for setting in run.find_far_out()) or None
+    return "; ".join(usual_ranges.describe(setting, run.recipe.get("algo")) for setting in run.find_far_out()) or None
 
 
 def policy_is_replaced(run: RunHistory) -> str | None:
@@ -151,6 +153,33 @@ def learner_slow(run: RunHistory) -> str | None:
     """Updates take most of the time."""
     shares = _read_shares(run)
     return shares.describe() if shares and shares.learner >= 0.75 else None
+
+
+def replays(run: RunHistory) -> str | None:
+    """The algorithm learns from a replay buffer."""
+    if "train_freq" not in run.parameters:
+        return None
+    return ", ".join(f"{name} {run.parameters[name]}" for name in ("train_freq", "gradient_steps"))
+
+
+def average_is_young(run: RunHistory) -> str | None:
+    """The last evaluation, of an averaged actor with few updates, is far below the training's return before it."""
+    decay, evaluated = run.parameters.get("actor_average"), run.evaluation_curve("return")
+    if not isinstance(decay, float) or not 0 < decay < 1 or not len(evaluated):
+        return None
+    step, score = evaluated.steps[-1], float(evaluated.values[-1])
+    updates, returns = run.curve("n_updates"), run.curve("return")
+    count = updates.values[updates.steps <= step][-1:]
+    before = returns.values[returns.steps <= step]
+    if len(before) < FEW_ROWS or not len(count) or count[0] > _YOUNG / (1 - decay):
+        return None
+    trained = float(np.median(before[-FEW_ROWS:]))
+    if trained - score <= _FAR_BELOW * float(np.ptp(before)):
+        return None
+    return (
+        f"the training's return before step {step:,.0f} is {trained:.4g}, the evaluation's {score:.4g}, after "
+        f"{count[0]:,.0f} updates; the average is over {1 / (1 - decay):,.0f}"
+    )
 
 
 def policy_slow(run: RunHistory) -> str | None:

@@ -41,6 +41,12 @@ def _rows() -> dict[str, Any]:
     return read_table("usual_ranges.yaml")
 
 
+def _find_row(name: str, algo: object) -> dict[str, Any] | None:
+    """Return what is usual for a hyperparameter of an algorithm; None where its meaning there is not known."""
+    rows: list[dict[str, Any]] = _rows()[name] if isinstance(_rows()[name], list) else [_rows()[name]]
+    return next((row for row in rows if algo in row.get("algos", [algo])), None)
+
+
 def list_names() -> list[str]:
     """Return the hyperparameters whose usual range is known."""
     return list(_rows())
@@ -54,11 +60,11 @@ def list_settings(names: Iterable[str], parameters: Mapping[str, Any], algo: obj
     """
     settings = []
     for name in names:
-        row = _rows()[name]
-        if name not in parameters or algo not in row.get("algos", [algo]):
+        row = _find_row(name, algo)
+        if name not in parameters or row is None:
             continue
         value = parameters[name]
-        factor = _count_times_out(name, value, n_envs)
+        factor = _count_times_out(name, value, _read_range(row, n_envs))
         advice = f"usually {row['range']}, often {row['common']}; raise: {row['raise']}; lower: {row['lower']}"
         if factor >= FAR_OUT:
             advice = f"{factor:.0f} times out of its usual range; {advice}"
@@ -76,10 +82,11 @@ def find_far_out(parameters: Mapping[str, Any], algo: object, n_envs: int) -> li
     return [setting for setting in settings if setting.is_far_out]
 
 
-def describe(setting: Setting) -> str:
+def describe(setting: Setting, algo: object) -> str:
     """Return `gamma 0.2: usually 0.9 to 0.9999; the policy then sees about 1 step ahead`."""
-    row = _rows()[setting.name]
-    low, _ = _read_range(setting.name, 1)
+    row = _find_row(setting.name, algo)
+    assert row is not None  # else it would be no setting of the algorithm
+    low, _ = _read_range(row, 1)
     number = read_first_value(setting.value)
     if setting.name == _GAMMA:
         consequence = f"the policy then {_describe_horizon(setting.value)}"
@@ -100,8 +107,7 @@ def _find_horizon(gamma: float) -> float:
     return 1 / (1 - gamma)
 
 
-def _read_range(name: str, n_envs: int) -> tuple[float, float]:
-    row = _rows()[name]
+def _read_range(row: Mapping[str, Any], n_envs: int) -> tuple[float, float]:
     low, high = (float(end) for end in row["range"].split(" to "))
     if row.get("low_per_env"):
         low /= n_envs
@@ -110,9 +116,9 @@ def _read_range(name: str, n_envs: int) -> tuple[float, float]:
     return low, high
 
 
-def _count_times_out(name: str, value: object, n_envs: int) -> float:
+def _count_times_out(name: str, value: object, usual: tuple[float, float]) -> float:
     """Return by what factor a value is above or below its usual range; 1 inside. Of gamma the horizon counts."""
-    low, high = _read_range(name, n_envs)
+    low, high = usual
     number = read_first_value(value)
     if number is None or number <= 0:
         return 1.0

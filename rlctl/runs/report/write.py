@@ -11,7 +11,7 @@ from rlctl import output
 from rlctl.errors import RlctlError, UsageError
 from rlctl.evaluation.eval_request import EvalRequest
 from rlctl.runs.compare.comparison import compare_runs
-from rlctl.runs.compare.report import describe_candidate, describe_seeds, describe_tests
+from rlctl.runs.compare.report import describe_candidate, describe_seeds, describe_tests, describe_verdict
 from rlctl.runs.report import content
 from rlctl.runs.report.content import RunReport
 from rlctl.runs.report.show import describe_robustness, tabulate
@@ -163,7 +163,7 @@ def _compare(report: RunReport, episodes: int) -> tuple[list[tuple[str, str, lis
     verdicts = [
         (
             f"{candidate.side.name} against {result.baseline.name}",
-            str(candidate.verdict),
+            describe_verdict(result, candidate),
             [*seeds, *describe_candidate(result, candidate), describe_tests(result)],
         )
         for candidate in result.candidates
