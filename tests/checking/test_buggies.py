@@ -1,0 +1,22 @@
+"""RL618, RL818, RL105: errors that are not wrapped next to robots without them, and what only looks like a mistake."""
+
+import pytest
+
+from tests.checking.judging import case, check_case, found, mark_slow
+
+pytest.importorskip("mujoco")
+FILE = "broken_buggies.py"
+
+CASES = [
+    case(f"{FILE}:RL618BuggyTurnsRound", ("RL618", "warning"), twin=f"{FILE}:Buggy"),
+]
+
+
+@pytest.mark.parametrize("case", mark_slow(CASES), ids=lambda case: case.broken)
+def test_finds_the_mistake_and_only_that(case):
+    check_case(case)
+
+
+@pytest.mark.slow
+def test_speeds_that_change_at_random_are_no_angle():
+    assert found(f"{FILE}:Balancer", "RL618") == set()
