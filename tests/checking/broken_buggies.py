@@ -77,7 +77,7 @@ class Balancer(MujocoRobot):
 
     rlctl_ignore = {"RL506": "a wrapper limits its episodes", "RL704": "no NaN comes from its controller"}
     xml, joints, frames = BALANCER, 2, 4
-    last_action, command = np.zeros(2), np.zeros(2)
+    last_action, command, count = np.zeros(2), np.zeros(2), 0
 
     def angles(self):
         w, x, y, z = self.data.qpos[3:7]
@@ -101,19 +101,19 @@ class Balancer(MujocoRobot):
         self.draw()
 
     def put_back(self):
-        self.last_action = np.zeros(2)
+        self.last_action, self.count = np.zeros(2), 0
 
     def step(self, action):
         self.data.ctrl[:] = action
         mujoco.mj_step(self.model, self.data, nstep=self.frames)
-        self.steps += 1
+        self.count += 1
         _, pitch = self.angles()
         wrong = self.command - [self.speed(), self.data.qvel[5]]
         reward = np.exp(-(wrong[0] ** 2) / 0.25) + 0.5 * np.exp(-(wrong[1] ** 2) / 0.25) + 0.5 * np.cos(pitch)
         reward -= 0.05 * np.sum((action - self.last_action) ** 2)
         terminated = bool(abs(pitch) > 0.8 or self.data.qpos[2] < 0.05)
         self.last_action = action.copy()
-        if self.steps % 200 == 0:
+        if self.count % 200 == 0:
             self.draw()
         return self.observe(), reward, terminated, False, self.info()
 
@@ -126,7 +126,7 @@ class Balancer(MujocoRobot):
         return np.concatenate([[pitch, *rates], self.data.qvel[6:8], self.last_action, self.command])
 
 
-class RL310BalancerKeepsItsAction(Balancer):
-    """A reset leaves the last action, and the next commands."""
+class BalancerCountsOn(Balancer):
+    """A reset leaves the last action, and the count of steps after which a command is drawn again."""
 
     def put_back(self): ...

@@ -20,3 +20,9 @@ def test_finds_the_mistake_and_only_that(case):
 @pytest.mark.slow
 def test_speeds_that_change_at_random_are_no_angle():
     assert found(f"{FILE}:Balancer", "RL618") == set()
+
+
+@pytest.mark.slow
+def test_a_count_that_a_reset_leaves_is_no_force():
+    # Some repetitions of an episode draw other commands: after 200 steps in all.
+    assert found(f"{FILE}:BalancerCountsOn", "RL818") == set()
