@@ -5,10 +5,11 @@ import pytest
 from tests.checking.judging import case, check_case, found, mark_slow
 
 pytest.importorskip("mujoco")
-FILE = "broken_buggies.py"
+FILE = "broken_wheeled_robots.py"
 
 CASES = [
     case(f"{FILE}:RL618BuggyTurnsRound", ("RL618", "warning"), twin=f"{FILE}:Buggy"),
+    case(f"{FILE}:RL105BalancerSharesItsWheels", ("RL105", "info"), twin=f"{FILE}:Balancer", slow=True),
 ]
 
 

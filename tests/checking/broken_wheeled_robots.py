@@ -130,3 +130,8 @@ class BalancerCountsOn(Balancer):
     """A reset leaves the last action, and the count of steps after which a command is drawn again."""
 
     def put_back(self): ...
+
+
+class RL105BalancerSharesItsWheels(Balancer):
+    def info(self):
+        return {"pitch": self.angles()[1], "wheels": self.data.qvel[6:8]}
