@@ -209,3 +209,34 @@ class BaseSeesXAndDirection(RL129BaseSeesX):
 class RL124BaseTurnsBack(Base):
     def seen(self):
         return self.axes() @ self.velocity
+
+
+class BaseForwards(Base):
+    """It keeps a speed forwards, and sees no other."""
+
+    def start(self):
+        super().start()
+        self.wanted = self.wanted[:1]
+        return self.observe()
+
+    def seen(self):
+        cosine, sine = self.axes()[:, 0]
+        return np.array([self.velocity[0] * cosine + self.velocity[1] * sine])
+
+
+class RL129BaseForwardsBack(BaseForwards):
+    """One sign of the turn is wrong."""
+
+    def seen(self):
+        cosine, sine = self.axes()[:, 0]
+        return np.array([self.velocity[0] * cosine - self.velocity[1] * sine])
+
+
+class RL129BaseForwardsInTheWorld(BaseForwards):
+    def seen(self):
+        return self.velocity[:1]
+
+
+class BaseForwardsInTheWorldAndYaw(RL129BaseForwardsInTheWorld):
+    def heading(self):
+        return [self.yaw]

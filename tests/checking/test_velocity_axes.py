@@ -22,6 +22,8 @@ CASES = [
     broken("RL129BaseInTheWorld", "BaseInTheWorldAndYaw", "RL129", pybullet=True, slow=True),
     broken("RL129BaseSeesX", "BaseSeesXAndDirection", "RL129", pybullet=True, slow=True),
     broken("RL124BaseTurnsBack", "Base", "RL124", pybullet=True, slow=True),
+    broken("RL129BaseForwardsBack", "BaseForwards", "RL129", pybullet=True, slow=True),
+    broken("RL129BaseForwardsInTheWorld", "BaseForwardsInTheWorldAndYaw", "RL129", pybullet=True, slow=True),
 ]
 
 
