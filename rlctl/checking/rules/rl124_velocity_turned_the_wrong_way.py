@@ -18,7 +18,7 @@ from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judg
 from rlctl.checking.fixed_directions import find_turned_directions, list_body_turns
 from rlctl.checking.heading_waves import observe_headings
 from rlctl.checking.readings import NEARLY_ALL
-from rlctl.checking.records import FIRST_SEED, Records
+from rlctl.checking.records import FIRST_SEED, Fact, Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.shared_frames import Turn, list_world_turns
 from rlctl.checking.transitions import name_floats
@@ -49,6 +49,7 @@ RULE = Rule(
 )
 
 CONFIRMED = 2  # starts that have to show it
+DOUBLE = "velocities that follow twice the heading"
 SAME = 5e-5  # of an element, relative to its value or to 1: see RL116
 LEAST_MOTION = 1e-3  # root mean square [m/s], [rad/s]
 LEAST_FACTOR = 1e-3  # by which a velocity may be scaled
@@ -77,8 +78,8 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
 
 
 @judges_turned(RULE, decides=False)
-def _find_double_turns(robot: TurnedRobot) -> Iterator[RuleFinding]:
-    """Yield velocities of a moving robot that follow twice its heading."""
+def _note_double_turns(robot: TurnedRobot) -> Iterator[Fact]:
+    """Note the names of velocities of a moving robot that follow twice its heading."""
     found = list[set[int]]()
     for number in range(CONFIRMED):
         waves = observe_headings(robot, number)
@@ -86,17 +87,17 @@ def _find_double_turns(robot: TurnedRobot) -> Iterator[RuleFinding]:
         if not columns:
             return
         found.append(columns)
-    if columns := set.intersection(*found):
-        names = name_floats(robot.instance.leaves)
-        listed = list_names([names[column] for column in sorted(columns)])
-        what = "are velocities that turn" if len(columns) > 1 else "is a velocity that turns"
-        message = f"{listed} {what} by twice the heading of the robot as it moves forwards: the heading turns it in the"
-        message += " wrong direction, and it is in no frame of the robot"
-        yield RuleFinding(RULE, message, {"element": names[min(columns)], "seed": FIRST_SEED})
+    names = name_floats(robot.instance.leaves)
+    yield Fact(DOUBLE, [names[column] for column in sorted(set.intersection(*found))])
 
 
 @judges_records(RULE, "worlds", "attributes", "turned")
 def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
+    if names := records.facts.get(DOUBLE):
+        what = "are velocities that turn" if len(names) > 1 else "is a velocity that turns"
+        message = f"{list_names(names)} {what} by twice the heading of the robot as it moves forwards: the heading"
+        message += " turns it in the wrong direction, and it is in no frame of the robot"
+        yield RuleFinding(RULE, message, {"element": names[0], "seed": FIRST_SEED})
     log = find_log_without_engine(records)
     if log is not None:
         yield from find_wrong_turns(log)
