@@ -36,17 +36,23 @@ class HeadingWaves:
 
     def list_velocities(self, times: int) -> set[int]:
         """Return the elements that only a movement changes, by the cosine of so many times the heading."""
-        moves, rolls = _change(self.moving), _change(self.rolling)
-        is_wave = self._is_wave(self.moving, times) | ~moves, self._is_wave(self.rolling, times) | ~rolls
-        return _list(is_wave[0] & is_wave[1] & (moves | rolls))
+        is_wave, is_changed = np.True_, np.False_
+        for rows in (self.moving, self.rolling):
+            added = rows - self.resting  # a reset may draw small velocities, which turn too
+            changes = (np.abs(added - added[0]) > self._allowed()).any(axis=0)
+            is_wave, is_changed = is_wave & (self._is_wave(added, times) | ~changes), is_changed | changes
+        return _list(np.asarray(is_wave & is_changed))
 
-    def _is_wave(self, rows: Numbers, times: int) -> NDArray[np.bool_]:
+    def _allowed(self) -> Numbers:
+        return SAME * np.maximum(1.0, np.abs(self.resting[0]))
+
+    def _is_wave(self, added: Numbers, times: int) -> NDArray[np.bool_]:
         angles = times * np.array(HEADINGS)
         waves = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
-        factors = np.linalg.lstsq(waves, rows, rcond=None)[0]
+        factors = np.linalg.lstsq(waves, added, rcond=None)[0]
         size = np.hypot(*factors[1:])
-        error = np.abs(rows - waves @ factors).max(axis=0)
-        at_rest = np.abs(self.resting - factors[0]).max(axis=0)
+        error = np.abs(added - waves @ factors).max(axis=0)
+        at_rest = np.maximum(np.abs(factors[0]), np.ptp(self.resting, axis=0) / 2)
         return np.asarray((error < WAVE_ERROR * size) & (at_rest < RESTING * size) & (size > LEAST_PART * SPEED))
 
     def has_own_velocity(self) -> bool:

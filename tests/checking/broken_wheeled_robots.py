@@ -135,3 +135,16 @@ class BalancerCountsOn(Balancer):
 class RL105BalancerSharesItsWheels(Balancer):
     def info(self):
         return {"pitch": self.angles()[1], "wheels": self.data.qvel[6:8]}
+
+
+class RL123BalancerSeesX(Balancer):
+    """A reset draws small velocities, which turn with it."""
+
+    def speed(self):
+        return self.data.qvel[0]
+
+
+class RL124BalancerTurnsBack(Balancer):
+    def speed(self):
+        yaw, _ = self.angles()
+        return self.data.qvel[0] * np.cos(yaw) - self.data.qvel[1] * np.sin(yaw)

@@ -1,4 +1,4 @@
-"""RL618, RL818, RL105: errors that are not wrapped next to robots without them, and what only looks like a mistake."""
+"""RL105, RL123, RL124, RL618, RL818: errors that are not wrapped next to robots without them, and what only looks like a mistake."""
 
 import pytest
 
@@ -10,6 +10,8 @@ FILE = "broken_wheeled_robots.py"
 CASES = [
     case(f"{FILE}:RL618BuggyTurnsRound", ("RL618", "warning"), twin=f"{FILE}:Buggy"),
     case(f"{FILE}:RL105BalancerSharesItsWheels", ("RL105", "info"), twin=f"{FILE}:Balancer", slow=True),
+    case(f"{FILE}:RL123BalancerSeesX", ("RL123", "warning"), twin=f"{FILE}:Balancer", slow=True),
+    case(f"{FILE}:RL124BalancerTurnsBack", ("RL124", "warning"), twin=f"{FILE}:Balancer", slow=True),
 ]
 
 
