@@ -31,7 +31,7 @@ class Recording:
         self._flags: list[tuple[bool, bool]] = []
         self._forms: dict[tuple[Any, ...], list[int]] = {}
         self._infos: dict[str, tuple[list[int], list[float]]] = {}
-        self._previous: dict[int, tuple[Any, NDArray[Any]]] = {}
+        self._previous: dict[tuple[str, Any], tuple[Any, NDArray[Any]]] = {}
 
     def run(self) -> list[CheckedEpisode | CallFailure]:
         """Play the episode to its end; return what to send: the trajectory, and the failure that ended it, if any."""
@@ -84,6 +84,12 @@ class Recording:
                     steps, values = self._infos.setdefault(name, ([], []))
                     steps.append(self._step)
                     values.append(value)
+            self._compare_info(info)
+
+    def _compare_info(self, info: dict[Any, Any]) -> None:
+        for name, value in info.items():
+            if isinstance(value, np.ndarray) and value.shape and value.dtype.kind in "biuf":
+                self._compare_memory("info memory", name, value, value.copy())
 
     def _add_reward(self, reward: Any) -> None:
         self._count_form("reward", name_type(reward))
@@ -114,20 +120,20 @@ class Recording:
             self._count_form("observation", name_type(value), index, None, None)
             return
         self._count_form("observation", name_type(value), index, str(array.dtype), array.shape)
-        self._compare_memory(index, value, array)
+        if isinstance(value, np.ndarray) and value.shape:
+            self._compare_memory("memory", index, value, array)
         if array.shape == leaf.shape and array.dtype.kind in "biuf":
             steps, values = self._values.setdefault(index, ([], []))
             steps.append(self._step)
             values.append(array)
             self.budget.bytes_left -= array.nbytes + 100
 
-    def _compare_memory(self, index: int, value: Any, copy: NDArray[Any]) -> None:
-        if not isinstance(value, np.ndarray) or not value.shape:
-            return
-        earlier = self._previous.get(index)
+    def _compare_memory(self, what: str, key: Any, value: NDArray[Any], copy: NDArray[Any]) -> None:
+        earlier = self._previous.get((what, key))
         if earlier is not None and np.shares_memory(earlier[0], value) and not np.array_equal(*earlier, equal_nan=True):
-            self._count_form("memory", "shared", index)
-        self._previous[index] = value, copy
+            name, leaf = ("shared", key) if what == "memory" else (str(key), None)
+            self._count_form(what, name, leaf)
+        self._previous[what, key] = value, copy
 
     @property
     def trajectory(self) -> CheckedEpisode:

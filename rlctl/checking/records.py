@@ -76,7 +76,7 @@ class Series:
 class Form:
     """A type that something had: where it came first, and how often."""
 
-    what: str  # `observation`, `memory`, `keys`, `info`, a flag, `reward`, `action`, `reset` or `step`
+    what: str  # `observation`, `memory`, `info memory`, `keys`, `info`, a flag, `reward`, `action`, `reset` or `step`
     type: str
     step: int
     count: int

@@ -30,17 +30,20 @@ PLANE = 0  # MuJoCo's type of a geom
 UP = (0.0, 0.0, 1.0)
 ENDLESS = 100.0  # [m]; the box of PyBullet's plane.urdf has 200 m, and its planes are larger
 LEVEL = 0.02  # how far static bodies may be above the lowest point of a robot [m]
+PUSHES, PUSHED_ANGLE, PUSHED_LIFT = 2, 1.3, 0.1  # actions that are tried, [rad], [m]
+LEAST_PUSH, PUSH_ERROR = 1e-4, 0.1  # [m/s], part of a push
 Numbers = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TurnedStep:
-    """What the first step returned, with the zero action."""
+    """What the first step returned."""
 
     heading: float  # of the robot before it, from the engine [rad]
     observed: Numbers  # The numbers that are floats. Shape (elements,)
     reward: float  # NaN where it is no number
     terms: Mapping[str, float]  # of the reward, by name; empty where info has none
+    velocity: complex  # level, in the frame of the world, from the engine: x + y j [m/s]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,27 +53,47 @@ class TurnedRobot:
     instance: Instance
 
     @functools.cached_property
-    def has_joints(self) -> bool:
-        """Whether the robot moves by joints, which turn with it; a force may be in the world's axes."""
+    def pushes_itself(self) -> bool:
+        """Whether what moves the robot turns with it: its joints, or the force of an action."""
+        return self._has_joints() or all(self._is_pushed_along(number) for number in range(PUSHES))
+
+    def _has_joints(self) -> bool:
         if (simulation := find_mujoco(self.instance.env)) is not None:
             return bool((simulation[0].jnt_type != FREE).any())
         return any(body.is_free and body.joints for c in self.instance.find_clients() for body in read_world(c).bodies)
 
+    def _is_pushed_along(self, number: int) -> bool:
+        """Say whether an action pushes the robot in a direction that turns with it."""
+        pushes = list[complex]()
+        for angle in (0.0, PUSHED_ANGLE):
+            zero, pushed = (self.play(number, angle, lift=PUSHED_LIFT, actions=kind) for kind in ("zero", "repeated"))
+            if zero is None or pushed is None:
+                return False
+            pushes.append(pushed.velocity - zero.velocity)
+        before, after = pushes
+        return abs(before) > LEAST_PUSH and abs(after * np.exp(-1j * PUSHED_ANGLE) - before) < PUSH_ERROR * abs(before)
+
     def play(
-        self, number: int, angle: float, speed: float = 0.0, lift: float = 0.0, spin: float = 0.0
+        self,
+        number: int,
+        angle: float,
+        speed: float = 0.0,
+        lift: float = 0.0,
+        spin: float = 0.0,
+        actions: str = "zero",
     ) -> TurnedStep | None:
         """Reset with a seed, turn the robot by an angle [rad] about the vertical, lift it [m], let it move forwards at
         a speed [m/s] and roll at a rate [rad/s], and take a step; None where time is over."""
         if self.instance.context.budget.is_over():
             return None
-        player = EpisodePlayer(self.instance, FIRST_SEED + number, "zero", max_steps=1)
+        player = EpisodePlayer(self.instance, FIRST_SEED + number, actions, max_steps=1)
         player.reset()
         heading = _turn(self.instance, angle, speed, lift, spin)
         moment = player.step()
         observed = flatten_floats(self.instance.leaves, moment.observation)
         numbers = find_numbers(moment.info) if isinstance(moment.info, dict) else ()
         terms = {name.removeprefix(TERMS): value for name, value in numbers if name.startswith(TERMS)}
-        return TurnedStep(heading, observed, moment.reward_number, terms)
+        return TurnedStep(heading, observed, moment.reward_number, terms, _read_velocity(self.instance))
 
 
 judges_turned = JudgeHook[TurnedRobot]()
@@ -166,3 +189,15 @@ def _turn_in_mujoco(model: Any, data: Any, angle: float, speed: float, lift: flo
     data.qvel[first + 3] += spin  # in the frame of the body
     sys.modules["mujoco"].mj_forward(model, data)
     return float(heading)
+
+
+def _read_velocity(instance: Instance) -> complex:
+    """Return the velocity of the free robot in the plane [m/s]."""
+    if (simulation := find_mujoco(instance.env)) is not None:
+        model, data = simulation
+        (joint,) = np.flatnonzero(model.jnt_type == FREE)
+        x, y = data.qvel[model.jnt_dofadr[joint] :][:2]
+    else:
+        (p, body), *_ = _find_free_bodies(instance.find_clients())
+        x, y, _ = p.getBaseVelocity(body)[0]
+    return complex(x, y)

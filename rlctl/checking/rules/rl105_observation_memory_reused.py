@@ -11,8 +11,11 @@ RULE = Rule(
     "RL105",
     "observation memory reused",
     Severity.INFO,
-    meaning="Two observations share memory, so a later step changes an observation that a buffer has stored.",
-    fix="Return a copy: `return self._observation.copy(), ...`.",
+    meaning="""
+        Two observations share memory, so a later step changes an observation that a buffer has stored. Or arrays in two
+        infos do, such as a command that is drawn into the same array again.
+    """,
+    fix="Return a copy: `return self._observation.copy(), ...`, and `info['command'] = self.command.copy()`.",
 )
 
 
@@ -21,4 +24,7 @@ def _find_shared_memory(records: Records) -> Iterator[RuleFinding]:
     for trajectory, form in records.forms("memory")[:1]:
         name = name_leaf(records.require_built().leaves[form.leaf or 0])
         message = f"step {form.step} changed the {name} that the previous call had returned"
+        yield RuleFinding(RULE, message, trajectory.at(form.step, steps=form.count))
+    for trajectory, form in records.forms("info memory")[:1]:
+        message = f"step {form.step} changed the array info[{form.type!r}] that the previous call had returned"
         yield RuleFinding(RULE, message, trajectory.at(form.step, steps=form.count))

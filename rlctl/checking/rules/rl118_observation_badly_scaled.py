@@ -15,8 +15,9 @@ RULE = Rule(
     "observation badly scaled",
     Severity.INFO,
     meaning="""
-        Elements of the observation are larger than 100. Networks expect inputs around 1 and learn slowly from
-        larger ones. Often the unit is millimetres or degrees by mistake.
+        Elements of the observation are larger than 100 as a root mean square over all steps; rare peaks above it do
+        no harm. Networks expect inputs around 1 and learn slowly from larger ones. Often the unit is millimetres or
+        degrees by mistake.
     """,
     fix="""
         Use metres and radians, divide by a usual value, or normalise observations (normalize: in the recipe,

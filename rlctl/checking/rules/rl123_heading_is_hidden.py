@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rlctl.checking.experiments.turned import TurnedRobot, TurnedStep, judges_turned
+from rlctl.checking.heading_waves import HEADINGS, SAME, observe_headings
 from rlctl.checking.records import FIRST_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.transitions import name_floats
@@ -17,9 +18,10 @@ RULE = Rule(
     meaning="""
         The check turned the robot about the vertical at the start, and let it move forwards. The observation is
         the same whatever its heading is, and the reward is another one: a policy cannot know in which direction
-        it is paid for moving. Or all of the observation is the same but a velocity in the axes of the world,
-        which says nothing to a robot with joints that does not know its heading. An info where all episodes
-        begin with nearly the same heading: then the policy only loses its way as it drifts.
+        it is paid for moving. Or all of the observation is the same but a velocity in the axes of the world, or
+        one axis of it, which says nothing to a robot that moves by joints, or is pushed in its own frame, and does
+        not know its heading. An info where all episodes begin with nearly the same heading: then the policy only
+        loses its way as it drifts.
     """,
     fix="""
         Observe the heading (its cosine and sine, or the way to the goal in the frame of the robot), or reward and
@@ -30,17 +32,12 @@ RULE = Rule(
 WAYS = ((0.5, 0.1), (0.15, 0.1), (0.5, 0.0))
 """Speeds forwards [m/s], and how far the robot is lifted [m]: in the air no friction changes with the direction. A
 reward that falls steeply with an error is nothing at the wrong speed."""
-ANGLES = (0.0, 1.3, 2.6, 3.9, 5.2)  # [rad]
 EPISODES, CONFIRMED = 5, 2  # that are played at most, and that have to show it: some commands are nearly 0
 ENOUGH, FEWEST_SAME = 4, 2  # headings after which something must be the same; pairs of all that must be
-SAME = 0.02  # part of an element's size, or of 1: friction differs a little with the direction
 MATTERS, NOTHING = 0.25, 0.01  # parts of what the direction of the movement changes in the reward: matters; does not
 MATTERS_STANDING = 0.5
 TINY = 1e-4  # what moving changes in a reward that does not depend on it
 STARTS, VARIED = 6, 0.5  # resets, and how far their headings are apart [rad]
-SPEED, LIFT, SPIN = 0.5, 0.1, 0.5  # [m/s], [m], [rad/s]
-TURN_ERROR, RESTING = 0.1, 0.3  # parts of the length of a velocity
-MOST_TURNED = 24  # elements
 Pair = tuple[TurnedStep, TurnedStep]
 
 
@@ -74,11 +71,11 @@ def _find_hidden_heading(robot: TurnedRobot) -> Iterator[RuleFinding]:
 def _find_world_velocity(robot: TurnedRobot) -> Iterator[RuleFinding]:
     """Yield a finding where velocities in the axes of the world are all of the observation that turns with the
     robot."""
-    if not robot.has_joints:
+    if not robot.pushes_itself:
         return
     found: list[set[int]] = []
     for number in range(CONFIRMED):
-        columns = _find_world_vectors(robot, number)
+        columns = _list_world_velocities(robot, number)
         if not columns:
             return
         found.append(columns)
@@ -87,32 +84,21 @@ def _find_world_velocity(robot: TurnedRobot) -> Iterator[RuleFinding]:
         return
     names = name_floats(robot.instance.leaves)
     listed = list_names([names[column] for column in sorted(columns)])
-    message = f"{listed} are a velocity in the axes of the world, and nothing of the observation shows the heading of"
+    what = "are a velocity" if len(columns) > 1 else "is a velocity"
+    message = f"{listed} {what} in the axes of the world, and nothing of the observation shows the heading of"
     message += " the robot: turned about the vertical, and moving in the same way, it observes the same otherwise"
     evidence = {"element": names[min(columns)], "seed": FIRST_SEED}
     yield RuleFinding(RULE, message, evidence, _judge_starts(robot))
 
 
-def _find_world_vectors(robot: TurnedRobot, number: int) -> set[int]:
-    """Return the elements that turn with the robot as a velocity in the axes of the world; none where others change
-    too."""
-    steps = [robot.play(number, angle, SPEED, LIFT, SPIN) for angle in ANGLES]
-    resting = robot.play(number, ANGLES[0], 0.0, LIFT)
-    if resting is None or any(step is None for step in steps):
+def _list_world_velocities(robot: TurnedRobot, number: int) -> set[int]:
+    """Return the elements that are a velocity in the axes of the world; none where others show the heading."""
+    waves = observe_headings(robot, number)
+    if waves is None:
         return set()
-    rows = np.array([step.observed for step in steps if step is not None])
-    allowed = SAME * np.maximum(1.0, np.abs(rows[0]))
-    changes = np.flatnonzero((np.abs(rows - rows[0]) > allowed).any(axis=0)).tolist()
-    turned: set[int] = set()
-    for column in changes[:MOST_TURNED]:
-        if column + 1 >= rows.shape[1]:
-            continue
-        block = rows[:, column] + 1j * rows[:, column + 1]
-        error = np.abs(block * np.exp(-1j * np.array(ANGLES)) - block[0]).max()
-        at_rest = np.hypot(*resting.observed[column : column + 2])
-        if error < TURN_ERROR * abs(block[0]) and at_rest < RESTING * abs(block[0]):
-            turned |= {column, column + 1}
-    return turned if set(changes) <= turned else set()
+    velocities = waves.list_velocities(times=1)
+    is_direction_shown = len(velocities) > 1 and waves.has_own_velocity()
+    return velocities if waves.list_changing() <= velocities and not is_direction_shown else set()
 
 
 def _hidden(robot: TurnedRobot, pair: tuple[TurnedStep, TurnedStep], speed: float) -> RuleFinding:
@@ -129,11 +115,11 @@ def _hidden(robot: TurnedRobot, pair: tuple[TurnedStep, TurnedStep], speed: floa
 def _play_angles(robot: TurnedRobot, number: int, speed: float, lift: float) -> tuple[Pair, float] | None:
     """Return two steps of moving forwards at headings with the same observation, and how far their rewards differ,
     as part of what moving backwards changes; None if the observation differs at nearly all headings."""
-    back = robot.play(number, ANGLES[0], -speed, lift)
+    back = robot.play(number, HEADINGS[0], -speed, lift)
     if back is None:
         return None
     steps: list[TurnedStep] = []
-    for angle in ANGLES:
+    for angle in HEADINGS:
         step = robot.play(number, angle, speed, lift)
         if step is None:
             return None

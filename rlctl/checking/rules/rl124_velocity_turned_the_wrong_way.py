@@ -13,12 +13,15 @@ from rlctl.checking.engine_values import NOISY, is_white
 from rlctl.checking.experiment import judges_records
 from rlctl.checking.experiments.attributes import AttributeLog, find_log_without_engine
 from rlctl.checking.experiments.expressions import NotedEpisodes, judges_expressions
+from rlctl.checking.experiments.turned import TurnedRobot, judges_turned
 from rlctl.checking.experiments.worlds import ObservedWorld, WatchedWorlds, judges_worlds
 from rlctl.checking.fixed_directions import find_turned_directions, list_body_turns
+from rlctl.checking.heading_waves import observe_headings
 from rlctl.checking.readings import NEARLY_ALL
-from rlctl.checking.records import Records
-from rlctl.checking.rule import Rule, RuleFinding, Severity
+from rlctl.checking.records import FIRST_SEED, Fact, Records
+from rlctl.checking.rule import Rule, RuleFinding, Severity, list_names
 from rlctl.checking.shared_frames import Turn, list_world_turns
+from rlctl.checking.transitions import name_floats
 from rlctl.checking.values import ArrayNames, name_numbers
 from rlctl.checking.worlds import ANGULAR, ORIENTATION, VELOCITY, Array
 
@@ -33,10 +36,11 @@ RULE = Rule(
         velocity, qvel[3:6], is in the frame of the body already. So it is with gravity; and with a direction that
         reset draws, to the sun say, which moves then as what is fixed to the body does. A robot without an engine is
         read from its attributes: its velocity is what changes its position, its frame the one in which its actions
-        push it, or the orientation that its angular velocity turns. Or a line of the source does so: it turns a
-        vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse, with a
-        way in the world; or it turns one vector of the world by an angle in the other direction than another one; or a
-        turn in the plane that is written by elements has one wrong sign, and turns nothing.
+        push it, or the orientation that its angular velocity turns. A robot on level ground is also turned by the
+        check: a velocity that follows twice its heading is turned the wrong way. Or a line of the source does so: it
+        turns a vector of the world by an orientation itself, or multiplies an axis of the body, turned by the inverse,
+        with a way in the world; or it turns one vector of the world by an angle in the other direction than another
+        one; or a turn in the plane that is written by elements has one wrong sign, and turns nothing.
     """,
     fix="""
         From the world to the body it is the inverse rotation: R.T @ v, or rotation.inv().apply(v). MuJoCo's qvel[3:6]
@@ -44,6 +48,8 @@ RULE = Rule(
     """,
 )
 
+CONFIRMED = 2  # starts that have to show it
+DOUBLE = "velocities that follow twice the heading"
 SAME = 5e-5  # of an element, relative to its value or to 1: see RL116
 LEAST_MOTION = 1e-3  # root mean square [m/s], [rad/s]
 LEAST_FACTOR = 1e-3  # by which a velocity may be scaled
@@ -71,8 +77,27 @@ def _find_wrong_turns(watched: WatchedWorlds) -> Iterator[RuleFinding]:
         yield from found or _find_directions(one.logs[0].parts, one.observed, one.episodes, list_world_turns(one))
 
 
-@judges_records(RULE, "worlds", "attributes")
+@judges_turned(RULE, decides=False)
+def _note_double_turns(robot: TurnedRobot) -> Iterator[Fact]:
+    """Note the names of velocities of a moving robot that follow twice its heading."""
+    found = list[set[int]]()
+    for number in range(CONFIRMED):
+        waves = observe_headings(robot, number)
+        columns = set() if waves is None else waves.list_velocities(times=2)
+        if not columns:
+            return
+        found.append(columns)
+    names = name_floats(robot.instance.leaves)
+    yield Fact(DOUBLE, [names[column] for column in sorted(set.intersection(*found))])
+
+
+@judges_records(RULE, "worlds", "attributes", "turned")
 def _find_wrong_turns_of_attributes(records: Records) -> Iterator[RuleFinding]:
+    if names := records.facts.get(DOUBLE):
+        what = "are velocities that turn" if len(names) > 1 else "is a velocity that turns"
+        message = f"{list_names(names)} {what} by twice the heading of the robot as it moves forwards: the heading"
+        message += " turns it in the wrong direction, and it is in no frame of the robot"
+        yield RuleFinding(RULE, message, {"element": names[0], "seed": FIRST_SEED})
     log = find_log_without_engine(records)
     if log is not None:
         yield from find_wrong_turns(log)

@@ -89,8 +89,9 @@ def _find_world_vectors(robot: RotatedRobot) -> Iterator[RuleFinding]:
 def _describe_doubles(robot: RotatedRobot, turnings: Sequence[Turning]) -> Iterator[RuleFinding]:
     names = name_floats(robot.instance.leaves)
     columns = np.flatnonzero(np.all([turning.doubles for turning in turnings], axis=0)).tolist()
-    if len(columns) > 1:
-        message = f"{list_names([names[column] for column in columns])} turn twice as far as the world does: they are"
+    if columns:
+        turn, are = ("turn", "they are") if len(columns) > 1 else ("turns", "it is")
+        message = f"{list_names([names[column] for column in columns])} {turn} twice as far as the world does: {are}"
         message += f" turned by the heading of the robot, {robot.heading_name}, in the wrong direction"
         yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, same=("RL124", "RL125"))
 

@@ -40,7 +40,8 @@ NEIGHBOURS = 3  # steps before and after a jump that it is compared with
 JUMP = 3.0  # times the largest change of its neighbours
 FEWEST_JUMPS, FEWEST_SEEDS = 4, 3
 MOST_PASSES = 0.4  # part of the passes with a jump: those near a difference of 0 have none
-LEAST_ROOM, SPREAD = 0.2, 1.5  # of pi - |e|: least [rad], and how much the largest of them exceed the smallest
+LEAST_ROOM, SPREAD = 0.2, 2.5  # of pi - |e|: least [rad], and how much the largest of them exceed the smallest
+LITTLE = 0.5  # [rad] by which e changes in a step
 SAME_FACTOR, MOST_FIT = 0.15, 0.7  # how equal factors are, and what part of all jumps they explain
 RARE = 0.05  # the same of all other steps, relative to that of the passes
 _SHIFTS = [shift for shift in range(-NEIGHBOURS, NEIGHBOURS + 1) if shift]
@@ -204,13 +205,16 @@ def _judge_passes(
 
 def _judge_errors(steps: Transitions, pairs: Sequence[tuple[int, int]], jumps: _Jumps) -> tuple[float, str] | None:
     """Return how the reward jumps as an error e that becomes e - 2 pi would make it, |e| and e^2 alike: by a constant
-    times pi - |e|, where its cosine and sine are observed, or a vector in its direction. None if it does not."""
+    times pi - |e|, where its cosine and sine are observed, or a vector in its direction. None if it does not. With
+    |e| before and after a step, the change of |e| is 2 pi less both: so pi less their mean is exact."""
     known = find_unit_pairs(steps.before)
     for cosine, sine in [pair for i, j in pairs for pair in ((i, j), (j, i))]:
         # One of many pairs that may be no direction fits a few jumps by chance.
         fewest = FEWEST_JUMPS if {(cosine, sine), (sine, cosine)} & {*known} else 2 * FEWEST_JUMPS
-        room = np.pi - np.abs(_angle(steps.after, cosine, sine))
-        rows = jumps.is_jump & (room > LEAST_ROOM)
+        angles = [_angle(rows, cosine, sine) for rows in (steps.before, steps.after)]
+        room = np.pi - np.mean(np.abs(angles), axis=0)
+        moved = np.abs((angles[1] - angles[0] + np.pi) % (2 * np.pi) - np.pi)
+        rows = jumps.is_jump & (room > LEAST_ROOM) & (moved < LITTLE)
         if not jumps.are_many(steps, rows, fewest):
             continue
         factors = jumps.sizes[rows] / room[rows]

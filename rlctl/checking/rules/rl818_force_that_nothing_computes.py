@@ -1,12 +1,12 @@
 """RL818: force that nothing computes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from rlctl.checking.experiments.worlds import MujocoTrials, judges_trials
-from rlctl.checking.mujoco_trials import name_columns, pair_rows, play
+from rlctl.checking.mujoco_trials import Look, name_columns, pair_rows, play
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.environments.simulations import find_mujoco
 
@@ -30,6 +30,7 @@ NEVER_COMPUTED = {
 }  # fmt: skip
 """Arrays that mj_step leaves at zero unless a sensor needs them, and what computes them."""
 LARGE = 100.0  # [N], [N m], [m/s]: a contact is often a force above a limit
+REPEATED = 2  # episodes that have to show it: what a reset leaves, such as a count of steps, may change one
 
 
 @judges_trials(RULE, place=20)
@@ -48,9 +49,8 @@ def _find_never_computed(trials: MujocoTrials) -> Iterator[RuleFinding]:
 
     play(instance, calls, after_step=note)
     for name in sorted(zero):
-        pair = pair_rows(plain, play(instance, calls, after_step=after_forces(name)))
-        columns = [] if pair is None else np.flatnonzero((pair[0] != pair[1]).any(axis=0)).tolist()
-        if columns and pair is not None:
+        changed = [_list_changed(plain, play(instance, calls, after_step=after_forces(name))) for _ in range(REPEATED)]
+        if columns := sorted(set.intersection(*changed)):
             verb = "is" if len(columns) == 1 else "are"
             what = f"{name_columns(columns, plain[0])} {verb} computed from data.{name}"
             message = f"{what}, which stays zero: nothing calls {NEVER_COMPUTED[name]}"
@@ -58,3 +58,8 @@ def _find_never_computed(trials: MujocoTrials) -> Iterator[RuleFinding]:
             simulation = find_mujoco(instance.env)
             if simulation is not None:
                 getattr(simulation[1], name)[:] = 0
+
+
+def _list_changed(plain: Sequence[Look], changed: Sequence[Look]) -> set[int]:
+    pair = pair_rows(plain, changed)
+    return set() if pair is None else set(np.flatnonzero((pair[0] != pair[1]).any(axis=0)).tolist())
