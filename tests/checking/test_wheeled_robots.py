@@ -1,4 +1,4 @@
-"""RL105, RL123, RL124, RL618, RL818: errors that are not wrapped next to robots without them, and what only looks like a mistake."""
+"""RL105, RL123, RL124, RL618, RL818 on robots with wheels, and on what only looks like their mistakes."""
 
 import pytest
 
