@@ -1,4 +1,4 @@
-"""RL105, RL123, RL124, RL618, RL818: errors that are not wrapped next to robots without them, and what only looks like a mistake."""
+"""RL105, RL123, RL124, RL618, RL818: robots on wheels with these mistakes, and with what only looks like one."""
 
 import pytest
 
