@@ -1,4 +1,4 @@
-"""RL105, RL123, RL124, RL618, RL818 on robots with wheels, and on what only looks like their mistakes."""
+"""RL105, RL123, RL124, RL618, RL818: robots on wheels with these mistakes, and with what only looks like one."""
 
 import pytest
 
