@@ -128,7 +128,7 @@ class RL119HopperCentimetres(MujocoHopper):
 
 
 class RL119ReacherCentimetres(Reacher):
-    rlctl_ignore = {"RL611": "chance does not reach its goal"}
+    rlctl_ignore = {**Reacher.rlctl_ignore, "RL611": "chance does not reach its goal"}
 
     def observe(self):
         observation = super().observe()
