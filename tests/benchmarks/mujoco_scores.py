@@ -209,7 +209,8 @@ def write_page(rows: list[Row]) -> None:
         f"returns of {LAST_EPISODES} episodes of the policy at the end, its 95 % interval from {_LEAST_FOR_INTERVAL}",
         f"seeds on, else their range; before the end, in the picture, {EPISODES} episodes. *Best policy*: that of the",
         "best evaluation, which rlctl keeps, plays and exports; its return is of new episodes.",
-        "A training learns for as many steps as its budget. *Published* are means of ten seeds on v4, computed from",
+        "A training learns for as many steps as its budget. With one core its minutes are an upper bound: others",
+        "computed beside it. *Published* are means of ten seeds on v4, computed from",
         "the curves of the authors, most with networks many times as wide.\n",
         f"![return over steps](pictures/{PICTURE.name})",
     ]

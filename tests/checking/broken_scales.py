@@ -21,6 +21,8 @@ class RL706HopperOnePercent(MujocoHopper):
 
 
 class RL625ReachOnePercent(Reach):
+    rlctl_ignore = {"RL611": "a consequence"}
+
     def move(self, action):
         super().move(0.01 * action)
 
@@ -42,6 +44,8 @@ class RL625FlyerOnePercent(OnePercent, FlyerSeeks): ...
 
 
 class RL706BulletArmOnePercent(Arm):
+    rlctl_ignore = {"RL611": "a consequence"}
+
     def target(self, action):
         return super().target(0.01 * action)
 
@@ -72,6 +76,7 @@ class RL624ArmTolerance(MujocoArm):
 
 
 class RL624ReachTolerance(Reach):
+    rlctl_ignore = {"RL611": "a consequence"}
     near = 0.001
 
 
@@ -84,6 +89,8 @@ class RL624DroneTolerance(Drone):
 
 
 class RL624ReacherTolerance(Reacher):
+    rlctl_ignore = {**Reacher.rlctl_ignore, "RL611": "a consequence"}
+
     def is_success(self):
         return bool(np.linalg.norm(self.to_goal()) < 0.002)
 

@@ -74,7 +74,7 @@ def test_from_python(run, pushed):
     action = policy.predict(observation)
     for address in (ADDRESS, f"{ADDRESS}/policies/best.safetensors"):
         assert (rlctl.load_policy(address).predict(observation) == action).all()
-    with pytest.raises(UsageError, match="on the task 'test', which is not installed"):  # what this policy was written for
+    with pytest.raises(UsageError, match="on the task 'test', which is not installed"):  # it was written for that
         rlctl.evaluate(ADDRESS, episodes=1)
 
 

@@ -50,8 +50,8 @@ def test_a_preset_that_is_not_there():
     assert str(caught.value) == (
         "no preset 'presets/pppo'. Did you mean 'presets/ppo'? "
         "Presets: presets/ant-v5, presets/biped-ladder, presets/gear-arm-ladder, presets/halfcheetah-v5, "
-        "presets/hopper-v5, presets/humanoid-v5, presets/inverteddoublependulum-v5, presets/ppo, presets/reacher-v5, "
-        "presets/sac, presets/swimmer-v5, presets/walker2d-v5, presets/xqc."
+        "presets/hopper-v5, presets/humanoid-v5, presets/inverteddoublependulum-v5, presets/ppo, presets/pusher-v5, "
+        "presets/reacher-v5, presets/sac, presets/swimmer-v5, presets/walker2d-v5, presets/xqc."
     )
 
 
