@@ -24,8 +24,18 @@ def digest_own_files(source: Path | None) -> dict[str, str]:
     if source is None or not source.is_file():
         return {}
     top = _find_top(source)
-    found = {file for file in _follow(source.resolve(), top) if file.stat().st_size <= _LARGEST}
-    return {file.relative_to(top).as_posix(): files.digest(file.read_bytes()) for file in sorted(found)}
+    states = {file: file.stat() for file in sorted(_follow(source.resolve(), top))}
+    return {
+        file.relative_to(top).as_posix(): _digest(file, state.st_mtime_ns, state.st_size)
+        for file, state in states.items()
+        if state.st_size <= _LARGEST
+    }
+
+
+@functools.lru_cache(maxsize=1024)
+def _digest(file: Path, _changed: int, _size: int) -> str:
+    """Return the SHA-256 of a file, which a list of many runs asks for again and again."""
+    return files.digest(file.read_bytes())
 
 
 def _find_top(source: Path) -> Path:
