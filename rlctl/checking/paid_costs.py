@@ -49,6 +49,11 @@ class PaidCost:
     place: ReadExpression
     why: str
 
+    @property
+    def is_of_error(self) -> bool:
+        """Whether it is the size of a difference: what is far from where it should be."""
+        return any(isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub) for node in ast.walk(self.place.node))
+
 
 class CostReader:
     """Finds them."""

@@ -125,8 +125,6 @@ class Docker(gym.Env):
 
 
 class RL622DockerFlees(Docker):
-    rlctl_ignore = {"RL621": "a consequence"}
-
     def shape(self, gap):
         change = gap - self.last_gap
         self.last_gap = gap

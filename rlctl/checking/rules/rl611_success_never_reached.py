@@ -14,12 +14,12 @@ RULE = Rule(
     "success never reached",
     Severity.INFO,
     meaning="""
-        is_success is in info, but was never true in any recorded episode, a search for high returns included. A
+        info reports success, but none came in any recorded episode, a search for high returns included. A
         hard task looks the same, so this is an info; but a success that no state can reach is a common mistake,
         and shows only after the training.
     """,
     fix="""
-        Put the robot at the goal by hand and check that is_success is true. If it is, the goal is only hard to
+        Put the robot at the goal by hand and check that a success is reported. If it is, the goal is only hard to
         find.
     """,
 )
@@ -32,7 +32,7 @@ FEWEST_STEPS = 500  # Steps of them: less is what raises, or ends, at once
 def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     episodes = rewards.require_readable(records)
     if not rewards.reports_success(episodes):
-        raise NotApplicable("is_success is not in info")
+        raise NotApplicable("info reports no success")
     if any(rewards.has_succeeded(episode) for episode in episodes):
         return
     steps = sum(episode.steps for episode in episodes)
@@ -42,5 +42,5 @@ def _find_no_success(records: Records) -> Iterator[RuleFinding]:
     best = max(episodes, key=lambda episode: float(np.nan_to_num(episode.rewards, nan=-np.inf).max()))
     step = int(np.nan_to_num(best.rewards, nan=-np.inf).argmax())
     reward = float(best.rewards[step])
-    message = f"is_success was never true in {rewards.summarize(episodes)}; best reward {reward:.4g} at step {step + 1}"
+    message = f"no success in {rewards.summarize(episodes)}; best reward {reward:.4g} at step {step + 1}"
     yield RuleFinding(RULE, message, best.at(step + 1, value=reward, episodes=len(episodes)))

@@ -56,7 +56,9 @@ def _find_paid_costs(notes: NotedEpisodes) -> Iterator[RuleFinding]:
     for paid in CostReader(notes).find():
         text = ast.unparse(paid.place.node)
         message = f"reward term {paid.summand.name!r} counts {paid.summand.weight:+.4g} times, and {text} {paid.why}"
-        yield RuleFinding(RULE, message, {"term": paid.summand.name}, where=notes.reward.locate(paid.summand.place))
+        line = notes.reward.locate(paid.summand.place)
+        same = ("RL622",) if paid.is_of_error else ()
+        yield RuleFinding(RULE, message, {"term": paid.summand.name}, where=line, same=same)
         return
 
 
