@@ -1,4 +1,7 @@
-"""Every case of the other files by all rules: no rule but the expected finds anything. Minutes; hence slow."""
+"""Every case of the other files by all rules: no rule but the expected finds anything. Half an hour; hence slow.
+
+That its own rules find nothing in its twin is for the other files: all rules there would take as long again.
+"""
 
 from importlib import import_module
 
@@ -24,7 +27,6 @@ pytestmark = pytest.mark.slow
 def test_finds_the_mistake_and_only_that(case):
     consequences = {one for rule in case.rules for one in CONSEQUENCES.get(rule, ())}
     assert found(case.broken) - consequences == case.expected - consequences
-    assert not {rule for rule, _ in found(case.twin)} & set(case.rules)
 
 
 @pytest.mark.parametrize("task", CLEAN)
