@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.audit import reaching, walking
+from rlctl.checking.audit import leading, reaching, walking
 from rlctl.checking.audit.play_world import Array, PlayedEpisode, PlayWorld, Script
 from rlctl.checking.episode import action_at, find_action_range
-from rlctl.checking.instance import Context, Instance
+from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.leaves import find_leaves
 from rlctl.policy.actor import Actor, Rows, act_one_by_one
@@ -42,6 +43,16 @@ class Plays:
         self._has_searched = False
         self._ways: dict[int, reaching.Way | None] = {}
         self._others: dict[Path, tuple[PlayWorld, FileActor]] = {}
+
+    @functools.cached_property
+    def lead(self) -> leading.Lead | None:
+        """The goal or the velocity that resets draw; None for a task, whose bodies can be moved."""
+        if self.world.task_env is not None:
+            return None
+        try:
+            return leading.find_lead(self.context)
+        except EnvironmentRaised:  # its goal is moved where it may never be
+            return None
 
     def stance(self, seed: int, number: int) -> walking.SettledPose:
         """Return how the robot with a free base stands in the episode of a seed."""
@@ -283,7 +294,20 @@ def _move_to(plays: Plays, way: reaching.Way, end: Array) -> Script:
     return Script(plays.still(), move=reaching.Moved(plays.world, way, end).move)
 
 
+def _bring_goal(plays: Plays, seed: int, number: int) -> Script | None:
+    lead = plays.lead
+    return None if lead is None or lead.source is None else lead.prepare(plays.still(), seed, plays.world.longest)
+
+
+def _stand_as_commanded(plays: Plays, seed: int, number: int) -> Script | None:
+    lead = plays.lead
+    return None if lead is None or lead.source else lead.prepare(plays.still(), seed, plays.world.longest)
+
+
 def _hover(plays: Plays, seed: int, number: int) -> Script | None:
+    if plays.lead is not None:
+        part = plays.lead.find_hover(seed)
+        return None if part is None else plays.lead.prepare(plays.still(), seed, plays.world.longest, part)
     way = plays.way(seed, number)
     beside = None if way is None else reaching.find_hover(plays.world, way, seed, number)
     if way is None or beside is None:
@@ -308,6 +332,8 @@ WANTED = (
     ),
     Competitor("reaching the goal", Kind.wanted, _reach_by_actions, lesson="to reach the goal"),
     Competitor("being at the goal", Kind.moved, _reach_by_engine, lesson="to be at the goal"),
+    Competitor("being met by the goal", Kind.moved, _bring_goal, lesson="to be at the goal"),
+    Competitor("standing as commanded", Kind.moved, _stand_as_commanded, lesson="to stand where that is commanded"),
 )
 OTHERS = (
     Competitor("standing still", Kind.idle, _hold_still, is_moved=True, lesson="to stand", does_nothing=True),

@@ -1,6 +1,7 @@
 """One world in which competitors play: its episodes, its commands, and a script that moves bodies in it."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -45,6 +46,7 @@ class Script:
 
     actor: Actor
     start: Callable[[], None] | None = None  # after the reset
+    before: Callable[[int], None] | None = None  # before each step, whose number from 1 it is given
     move: Callable[[int], None] | None = None  # after the physics of each step, whose number from 1 it is given
     world: "PlayWorld | None" = None  # where it is not played in the common one
     accepts: Callable[[PlayedEpisode], bool] = lambda played: True
@@ -137,6 +139,8 @@ class PlayWorld:
         self._set_move(script.move)
         try:
             for step in range(longest):
+                if script.before is not None:
+                    self.ask(functools.partial(script.before, step + 1))
                 taken: Played | None = self.instance.call("step", next, steps, None, step=step + 1)
                 if taken is None:
                     break

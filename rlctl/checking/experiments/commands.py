@@ -22,6 +22,11 @@ COMMAND_WORDS = {"cmd", "cmds", "command", "commanded", "commands", "setpoint", 
 WISH_WORDS = {"desired", "ref", "reference", "target", "targets"}
 MOTION_WORDS = {"height", "rate", "rates", "speed", "speeds", "turn", "vel", "velocities", "velocity", "yaw"}
 """What a wish is about that is paid in every step, and not only near a goal."""
+OTHER_WORDS = {
+    "angle", "attitude", "gait", "heading", "height", "joint", "joints", "mode", "phase", "pitch", "pose", "position",
+    "roll",
+}  # fmt: skip
+"""What is commanded that is no velocity."""
 MOST_NUMBERS = 32  # of an attribute: a plan has several commands
 FIRST_STEPS, LATER_STEPS = 8, 3  # with the command that reset drew, and with another one
 SEEDS = 4
@@ -89,10 +94,9 @@ def change_commands(context: Context) -> Iterator[ChildMessage]:
     paid: list[DrawnPlace] = []
     unpaid: list[DrawnPlace] = []
     trials = CommandTrials(instance, paid, unpaid, found.sizes, names)
-    for name, places in found.stays.items():
+    for places in found.stays.values():
         for place in places:
-            shown = [names[element] for element, _ in find_copies(instance, place)]
-            if not shown or not any(_is_command(one) for one in (name, *shown)):
+            if not _shows_command(instance, place, names):
                 continue
             decides = trials.decides(place)
             if decides is not None:
@@ -102,6 +106,28 @@ def change_commands(context: Context) -> Iterator[ChildMessage]:
     if not paid and not unpaid:
         raise NotApplicable("no command that reset draws is observed")
     yield from judges_commands.judge(trials)
+
+
+def list_commands(instance: Instance) -> list[DrawnPlace]:
+    """Return the commands that resets draw and the observation shows, with all of their numbers, one an attribute."""
+    names = _name_elements(instance)
+    found = find_drawn(instance, _list_numbers)
+    commands = []
+    for name, places in found.stays.items():
+        shown = [place.elements[0] for place in places if _shows_command(instance, place, names)]
+        commands += [DrawnPlace(name, tuple(shown))] if shown else []
+    return commands
+
+
+def _shows_command(instance: Instance, place: DrawnPlace, names: Sequence[str]) -> bool:
+    """Say whether the observation shows a number, and the attribute or what it is observed as is called a command."""
+    shown = [names[element] for element, _ in find_copies(instance, place)]
+    return bool(shown) and any(_is_command(one) for one in (place.name, *shown))
+
+
+def is_velocity(name: str) -> bool:
+    """Say whether a command is one of a velocity by its name, or says not what it is."""
+    return not {*split_name(name)} & OTHER_WORDS
 
 
 def _name_elements(instance: Instance) -> list[str]:

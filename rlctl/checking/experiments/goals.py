@@ -64,7 +64,21 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
     instance = context.instance
     if not instance.accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
-    places, by_chance = _find_drawn(instance)
+    places, by_chance = find_places(instance)
+    drawn = find_drawn_goal(context, places)
+    if drawn is not None:
+        yield Fact("goals", drawn)
+        yield from judges_goals.judge(GoalTrials(instance, drawn))
+        return
+    yield from _find_scaled(instance, places)
+    if by_chance:
+        raise NotJudged("the seed does not determine what reset draws (RL301)")
+    raise NotApplicable("the observation follows no attribute that reset draws")
+
+
+def find_drawn_goal(context: Context, places: Sequence[DrawnPlace]) -> DrawnGoal | None:
+    """Return the first of some drawn places that the observation follows."""
+    instance = context.instance
     for place in places:
         copies, scales = find_copies(instance, place), _find_turned(instance, place)
         turned = [(element, TURNED) for element in scales]
@@ -79,14 +93,8 @@ def find_goals(context: Context) -> Iterator[ChildMessage]:
                     break
                 instance.reset(seed)
                 goals[seed] = place.read(instance.env).tolist()
-            drawn = DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies), scales, pose)
-            yield Fact("goals", drawn)
-            yield from judges_goals.judge(GoalTrials(instance, drawn))
-            return
-    yield from _find_scaled(instance, places)
-    if by_chance:
-        raise NotJudged("the seed does not determine what reset draws (RL301)")
-    raise NotApplicable("the observation follows no attribute that reset draws")
+            return DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies), scales, pose)
+    return None
 
 
 def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[Fact]:
@@ -99,7 +107,7 @@ def _find_scaled(instance: Instance, places: Sequence[DrawnPlace]) -> Iterator[F
                 return
 
 
-def _find_drawn(instance: Instance) -> tuple[list[DrawnPlace], list[str]]:
+def find_places(instance: Instance) -> tuple[list[DrawnPlace], list[str]]:
     """Return the places in attributes that a reset draws by its seed and no step changes, and the names of the others
     that it draws."""
     found = find_drawn(instance, _list_places)

@@ -112,5 +112,6 @@ def test_judges_alike_in_mujoco(name):
 
 def test_two_processes_begin_at_both_ends_of_the_list():
     even, odd = (child.order(list_competitors(), number) for number in (0, 1))
-    assert {one.name for one in even[:4]} == {one.name for one in odd[:4]} == {one.name for one in WANTED_PLAYS}
-    assert even[4:] == odd[:3:-1]
+    first = len(WANTED_PLAYS)
+    assert {*even[:first]} == {*odd[:first]} == {*WANTED_PLAYS}
+    assert even[first:] == odd[: first - 1 : -1]
