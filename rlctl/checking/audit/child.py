@@ -8,7 +8,7 @@ from rlctl.checking import child
 from rlctl.checking.audit.competitors import Competitor, Kind, Plays, check_instance, list_competitors
 from rlctl.checking.experiment import Experiment
 from rlctl.checking.instance import MOST_FAILURES, Context, EnvironmentRaised, describe_failure
-from rlctl.checking.records import FIRST_SEED, ChildMessage, Fact, Skipped
+from rlctl.checking.records import ChildMessage, Fact, Skipped
 from rlctl.checking.rule import NotJudged
 from rlctl.environments.spec import EnvSpec
 from rlctl.errors import RlctlError
@@ -84,7 +84,7 @@ def order(competitors: list[Competitor], number: int) -> list[Competitor]:
 
 
 def _play(plays: Plays, competitor: Competitor, number: int) -> Iterator[ChildMessage]:
-    seed = FIRST_SEED + number
+    seed = plays.seeds[number]
     script = competitor.prepare(plays, seed, number)
     if script is None:
         return

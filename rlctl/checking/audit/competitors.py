@@ -3,7 +3,7 @@
 import dataclasses
 import enum
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlctl.checking.audit import leading, reaching, walking
-from rlctl.checking.audit.play_world import Array, PlayedEpisode, PlayWorld, Script
+from rlctl.checking.audit.play_world import COMMANDED, Array, PlayedEpisode, PlayWorld, Script
 from rlctl.checking.episode import action_at, find_action_range
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
+from rlctl.checking.records import FIRST_SEED
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.leaves import find_leaves
 from rlctl.policy.actor import Actor, Rows, act_one_by_one
@@ -53,6 +54,12 @@ class Plays:
             return leading.find_lead(self.context)
         except EnvironmentRaised:  # its goal is moved where it may never be
             return None
+
+    @functools.cached_property
+    def seeds(self) -> Sequence[int]:
+        """The seeds of the rounds."""
+        count = len(COMMANDED)
+        return range(FIRST_SEED, FIRST_SEED + count) if self.lead is None else self.lead.list_seeds(count)
 
     def stance(self, seed: int, number: int) -> walking.SettledPose:
         """Return how the robot with a free base stands in the episode of a seed."""

@@ -16,6 +16,7 @@ from rlctl.checking.records import FIRST_SEED
 from rlctl.policy.actor import Actor
 
 APPROACH = 50  # steps in which a goal comes
+TRIED = 3  # times as many seeds as are played
 SEEDS, STEPS = range(FIRST_SEED, FIRST_SEED + 4), 10
 """Of episodes, and their steps, in which it is compared what is paid."""
 
@@ -26,6 +27,17 @@ class Lead:
 
     trials: GoalTrials
     source: Source | None  # of the place where the goal is a success; None for a velocity: it stands, and follows 0
+
+    def list_seeds(self, count: int) -> list[int]:
+        """Return the seeds whose goals are farthest away, of several times as many: near ones are met by chance."""
+        distances = {seed: self._measure_distance(seed) for seed in range(FIRST_SEED, FIRST_SEED + TRIED * count)}
+        return sorted(distances, key=lambda seed: -distances[seed])[:count]
+
+    def _measure_distance(self, seed: int) -> float:
+        episode = GoalEpisode(self.trials, seed, "zero")
+        if self.source is None:
+            return float(np.linalg.norm(episode.goal))
+        return episode.measure_distance(self.source)
 
     def prepare(self, actor: Actor, seed: int, longest: int, part: float = 0.0) -> Script:
         """Return the play of an episode in which the goal comes to the robot, up to a part of the way."""

@@ -1,9 +1,10 @@
 """Of environments whose bodies nobody may move, the goal comes to the robot, or it stands where that is commanded."""
 
+import numpy as np
 import pytest
 
 from rlctl.checking.audit import child, leading
-from rlctl.checking.audit.competitors import list_competitors
+from rlctl.checking.audit.competitors import Plays, list_competitors
 from rlctl.checking.audit.ranking import rank
 from rlctl.checking.drawn_goals import TURNED
 from rlctl.checking.instance import Budget, Context
@@ -44,6 +45,15 @@ def test_the_goal_comes_to_a_robot_that_does_nothing():
     assert (ranking.wanted, ranking.beaten) == (MET, [])
 
 
+def test_goals_are_played_that_are_far_away():
+    context = begin("broken_paid.py:Docker")
+    plays = Plays(context)
+    goals = plays.lead.trials.drawn.goals
+    away = {seed: np.linalg.norm(goals[seed]) for seed in range(FIRST_SEED, FIRST_SEED + 12)}  # from where it begins
+    assert {*plays.seeds} == {*sorted(away, key=away.get)[-4:]}
+    context.instance.close()
+
+
 def test_who_waits_beside_the_goal_earns_more_than_one_who_is_there():
     _, ranking = play("broken_paid.py:RL605DockerWaits", MET, HOVERING)
     assert [(one.competitor, one.wanted) for one in ranking.beaten] == [(HOVERING, MET)]
@@ -71,5 +81,5 @@ def test_what_has_no_goal_and_what_is_a_task_are_left_alone(task):
     context = Context(EnvSpec(task))
     context.budget = Budget(read_clock() + 100.0)
     competitors = [one for one in list_competitors() if one.name in (MET, STANDING)]
-    assert list(child.play_rounds(context, competitors, FIRST_SEED, rounds=1)) == []
+    assert list(child.play_rounds(context, competitors, 0, rounds=1)) == []
     context.instance.close()
