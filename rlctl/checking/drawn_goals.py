@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.values import Attribute, read_attributes, shape_like
+from rlctl.checking.values import Attribute, find_author, read_attributes, shape_like
 from rlctl.checking.workspaces import Reach
 
 SPACE = 3  # axes of the world
@@ -49,6 +49,10 @@ class DrawnPlace:
     def find(self, env: Any) -> Attribute:
         """Return the attribute, with a copy of its present value."""
         return read_attributes(env)[self.name]
+
+    def find_again(self, attribute: Attribute, env: Any) -> Attribute:
+        """Return an attribute of the present state: steps may have put another object where its owner was."""
+        return attribute if attribute.owner is find_author(env) else self.find(env)
 
     def read(self, env: Any) -> Numbers:
         """Return the place. Shape (size,)."""
