@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlctl.checking.rule import NotJudged
 from rlctl.checking.values import Attribute, find_author, read_attributes, shape_like
 from rlctl.checking.workspaces import Reach
 
@@ -47,8 +48,14 @@ class DrawnPlace:
         return list(self.elements if max(self.elements) < SPACE else range(self.size))
 
     def find(self, env: Any) -> Attribute:
-        """Return the attribute, with a copy of its present value."""
-        return read_attributes(env)[self.name]
+        """Return the attribute, with a copy of its present value.
+
+        Raises `NotJudged` where this episode does not have it, or has a shorter one.
+        """
+        attribute = read_attributes(env).get(self.name)
+        if attribute is None or attribute.numbers.size <= max(self.elements):
+            raise NotJudged(f"not every episode has the goal {self.name}")
+        return attribute
 
     def find_again(self, attribute: Attribute, env: Any) -> Attribute:
         """Return an attribute of the present state: steps may have put another object where its owner was."""
@@ -67,7 +74,8 @@ class DrawnPlace:
         copy."""
         numbers = attribute.numbers.copy()
         for elements in [self.elements, *(self.later if together else ())]:
-            numbers[list(elements)] = place
+            if max(elements) < numbers.size:  # a reset may draw how many goals there are
+                numbers[list(elements)] = place
         attribute.assign(shape_like(attribute.value, numbers))
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlctl.checking.experiment import PROBE
+from rlctl.checking.experiment import INSTANCES, PROBE
 from rlctl.checking.experiments.attributes import find_declared_numbers
 from rlctl.checking.expressions import record_expressions
-from rlctl.checking.records import Finished
+from rlctl.checking.records import Finished, Skipped
 from rlctl.checking.rule import RuleFinding
 from rlctl.checking.source_code import SourceCode
 from rlctl.checking.values import read_attributes, shape_like
@@ -69,6 +69,62 @@ class Robot(gymnasium.Env):
         return self.observe(), -distance, is_success, self.steps >= 60, {"is_success": is_success}
 
 
+class Pixels(Robot):
+    """Sees only an image."""
+
+    observation_space = spaces.Box(0, 255, (16, 16, 1), np.uint8)
+
+    def observe(self):
+        image = np.zeros((16, 16, 1), np.uint8)
+        for point, color in zip(self.read(), (100, 200), strict=True):
+            row, column = np.clip((point + 1) * 8, 0, 15).astype(int)
+            image[row, column] = color
+        return image
+
+
+class Course(Robot):
+    """Has two or three waypoints, of which the first is to be reached."""
+
+    def start(self):
+        self.place = self.np_random.uniform(-1, 1, 2)
+        self.waypoints = self.np_random.uniform(-1, 1, (self.np_random.integers(2, 4), 2))
+
+    def read(self):
+        return self.place, self.waypoints[0]
+
+    def move(self, way):
+        self.place = self.place + way
+
+
+class Forgetful(Course):
+    """Has a goal only now and then."""
+
+    def start(self):
+        super().start()
+        chosen = "goal" if self.np_random.uniform() < 0.8 else "other"
+        self.kept = {chosen: self.waypoints[0].copy()}
+
+    def read(self):
+        return self.place, next(iter(self.kept.values()))
+
+
+class Gusts(Course):
+    """Is pushed by one or two hidden gusts."""
+
+    observation_space = spaces.Box(-20.0, 20.0, (2,), np.float64)
+
+    def start(self):
+        super().start()
+        self.gusts = self.np_random.uniform(-1, 1, self.np_random.integers(1, 3))
+
+    def observe(self):
+        return self.place.copy()
+
+    def step(self, action):
+        observation, _, _, is_late, info = super().step(action)
+        return observation, float(self.gusts.sum() - np.abs(self.place).sum()), False, is_late, info
+
+
 class Numbers(Robot):
     """Computes with a number that no float has."""
 
@@ -116,9 +172,17 @@ def test_whole_numbers_that_no_float_has_are_left_out():
     ("name", "process", "experiments"),
     [
         ("Robot", PROBE, ("goals", "rotated")),
+        ("Pixels", PROBE, ("goals", "rotated")),
+        ("Course", PROBE, ("goals",)),
+        ("Forgetful", PROBE, ("goals",)),
+        ("Gusts", INSTANCES, ("hidden state",)),
     ],
 )
 def test_experiments_do_not_crash(name, process, experiments):
     messages = list(run_here(process, f"{__file__}:{name}", ["build", *experiments], 60.0))
     assert [message.crash for message in messages if isinstance(message, Finished)] == [""] * (1 + len(experiments))
-    assert not any(isinstance(message, RuleFinding) for message in messages)
+    rules = {message.rule for message in messages if isinstance(message, RuleFinding)}
+    assert rules <= ({"RL114"} if name == "Gusts" else set())
+    if name == "Pixels":
+        reasons = {message.name: message.reason for message in messages if isinstance(message, Skipped)}
+        assert reasons["rotated"] == "nothing that is observed is a real number"
