@@ -125,6 +125,23 @@ class Gusts(Course):
         return observation, float(self.gusts.sum() - np.abs(self.place).sum()), False, is_late, info
 
 
+class Incomplete(Robot):
+    """Leaves a key of its observation out in every other step."""
+
+    observation_space = spaces.Dict({name: spaces.Box(-20.0, 20.0, (2,), np.float64) for name in ("place", "goal")})
+
+    def observe(self):
+        observation = dict(zip(("place", "goal"), self.read(), strict=True))
+        return observation if self.steps % 2 == 0 else {"place": observation["place"]}
+
+
+class Growing(Robot):
+    """Returns more numbers in some steps."""
+
+    def observe(self):
+        return np.concatenate([*self.read(), np.zeros(self.steps % 3)])
+
+
 class Numbers(Robot):
     """Computes with a number that no float has."""
 
@@ -176,6 +193,8 @@ def test_whole_numbers_that_no_float_has_are_left_out():
         ("Course", PROBE, ("goals",)),
         ("Forgetful", PROBE, ("goals",)),
         ("Gusts", INSTANCES, ("hidden state",)),
+        ("Incomplete", PROBE, ("attributes", "goals", "commands", "sums", "rotated")),
+        ("Growing", PROBE, ("sums",)),
     ],
 )
 def test_experiments_do_not_crash(name, process, experiments):
