@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from rlctl.checking.drawn_goals import DrawnPlace
 from rlctl.checking.experiment import INSTANCES, PROBE
 from rlctl.checking.experiments.attributes import find_declared_numbers
 from rlctl.checking.expressions import record_expressions
 from rlctl.checking.records import Finished, Skipped
-from rlctl.checking.rule import RuleFinding
+from rlctl.checking.rule import NotJudged, RuleFinding
 from rlctl.checking.source_code import SourceCode
 from rlctl.checking.values import read_attributes, shape_like
 from tests.checking.judging import run_here
-
-HUGE = 10**400
 
 
 class Vector(tuple):
@@ -96,18 +95,6 @@ class Course(Robot):
         self.place = self.place + way
 
 
-class Forgetful(Course):
-    """Has a goal only now and then."""
-
-    def start(self):
-        super().start()
-        chosen = "goal" if self.np_random.uniform() < 0.8 else "other"
-        self.kept = {chosen: self.waypoints[0].copy()}
-
-    def read(self):
-        return self.place, next(iter(self.kept.values()))
-
-
 class Gusts(Course):
     """Is pushed by one or two hidden gusts."""
 
@@ -145,8 +132,10 @@ class Growing(Robot):
 class Numbers(Robot):
     """Computes with a number that no float has."""
 
+    huge = 10**400
+
     def move(self, way):
-        numbers = [HUGE, 1]
+        numbers = [self.huge, 1]
         super().move(way * len(list(numbers)))
 
 
@@ -172,14 +161,19 @@ def test_a_frozen_state_is_replaced():
     assert env.state.goal.tolist() == [3.0, 3.0]
 
 
+def test_a_goal_that_an_episode_does_not_have_is_not_judged():
+    with pytest.raises(NotJudged, match=r"not every episode has the goal self\.goal"):
+        DrawnPlace("self.goal", (0, 1)).find(Holder())
+
+
 def test_whole_numbers_that_no_float_has_are_left_out():
     env = Numbers()
     env.reset(seed=0)
-    env.key, env.keys, env.count = HUGE, [HUGE, 1], 3
+    env.key, env.keys, env.count = env.huge, [env.huge, 1], 3
     assert {"self.key", "self.keys"}.isdisjoint(read_attributes(env))
     declared = find_declared_numbers(env)
     assert declared["self.count"] == 3.0
-    assert "HUGE" not in declared
+    assert "huge" not in declared
     with record_expressions(SourceCode(env)) as recorder, recorder.call(1) as noted:
         env.step(np.zeros(2))
     assert noted.events
@@ -191,7 +185,6 @@ def test_whole_numbers_that_no_float_has_are_left_out():
         ("Robot", PROBE, ("goals", "rotated")),
         ("Pixels", PROBE, ("goals", "rotated")),
         ("Course", PROBE, ("goals",)),
-        ("Forgetful", PROBE, ("goals",)),
         ("Gusts", INSTANCES, ("hidden state",)),
         ("Incomplete", PROBE, ("attributes", "goals", "commands", "sums", "rotated")),
         ("Growing", PROBE, ("sums",)),
