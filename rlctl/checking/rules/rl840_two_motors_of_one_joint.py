@@ -19,7 +19,8 @@ RULE = Rule(
     meaning="""
         In a MuJoCo model two actuators of the same kind drive one joint, and another joint has none, most often since a
         name was copied and not changed. Two elements of the action then add up at one joint, and the other hangs
-        loose. Actuators of different kinds on one joint, such as position and velocity, belong together.
+        loose. Actuators of different kinds on one joint, such as position and velocity, belong together, and so do two
+        of which each pushes in one direction.
     """,
     fix="Name each joint once in the actuators of the model.",
 )
