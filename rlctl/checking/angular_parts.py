@@ -92,7 +92,7 @@ def _is_filled(function: ast.AST, owner: ast.expr) -> bool:
 
 
 def _is_first_half(index: ast.expr) -> bool:
-    last = index.elts[-1] if isinstance(index, ast.Tuple) else index
+    last = index.elts[-1] if isinstance(index, ast.Tuple) and index.elts else index
     match last:
         case ast.Slice(lower=None | ast.Constant(value=0 | 1), upper=ast.Constant(value=1 | 2 | 3), step=None):
             return True

@@ -4,7 +4,7 @@ import ast
 import collections
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 
 from rlctl.checking.assignments import (
     LIBRARIES,
@@ -262,7 +262,8 @@ class Definitions:
         keys = [read_key(one) for one in nodes if isinstance(one, ast.Attribute | ast.Subscript)]
         return {key for key in keys if key}
 
-    def list_sets(self, node: ast.AST, depth: int = MOST_DEEP) -> set[str]:
+    @functools.cache  # noqa: B019  # as `list_assigned`; functions are asked for again and again
+    def list_sets(self, node: ast.AST, depth: int = MOST_DEEP) -> Set[str]:
         """Return the keys of the attributes that a statement sets, also in functions that it calls."""
         found: set[str] = set()
         for one in ast.walk(node):

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlctl.checking.values import Attribute, read_attributes, shape_like
+from rlctl.checking.rule import NotJudged
+from rlctl.checking.values import Attribute, find_author, read_attributes, shape_like
 from rlctl.checking.workspaces import Reach
 
 SPACE = 3  # axes of the world
@@ -47,8 +48,18 @@ class DrawnPlace:
         return list(self.elements if max(self.elements) < SPACE else range(self.size))
 
     def find(self, env: Any) -> Attribute:
-        """Return the attribute, with a copy of its present value."""
-        return read_attributes(env)[self.name]
+        """Return the attribute, with a copy of its present value.
+
+        Raises `NotJudged` where this episode does not have it, or has a shorter one.
+        """
+        attribute = read_attributes(env).get(self.name)
+        if attribute is None or attribute.numbers.size <= max(self.elements):
+            raise NotJudged(f"not every episode has the goal {self.name}")
+        return attribute
+
+    def find_again(self, attribute: Attribute, env: Any) -> Attribute:
+        """Return an attribute of the present state: steps may have put another object where its owner was."""
+        return attribute if attribute.owner is find_author(env) else self.find(env)
 
     def read(self, env: Any) -> Numbers:
         """Return the place. Shape (size,)."""
@@ -63,7 +74,8 @@ class DrawnPlace:
         copy."""
         numbers = attribute.numbers.copy()
         for elements in [self.elements, *(self.later if together else ())]:
-            numbers[list(elements)] = place
+            if max(elements) < numbers.size:  # a reset may draw how many goals there are
+                numbers[list(elements)] = place
         attribute.assign(shape_like(attribute.value, numbers))
 
 

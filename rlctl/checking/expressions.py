@@ -218,7 +218,9 @@ def _freeze(value: Any) -> Value:
         and len(value) <= MOST_NUMBERS
         and all(isinstance(one, NUMBERS) for one in value)
     ):
-        return np.array(value, np.float64)
+        with contextlib.suppress(OverflowError):  # a whole number of hundreds of digits
+            return np.array(value, np.float64)
+        return None
     return _flatten(value) if kind is tuple else None
 
 

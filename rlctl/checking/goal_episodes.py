@@ -228,6 +228,7 @@ class GoalEpisode:
     def step(self, goal: Numbers | None = None) -> GoalStep:
         """Set the goal, if one is given, and take a step."""
         if goal is not None:
+            self._attribute = self._place.find_again(self._attribute, self._instance.env)
             self._place.assign(self._attribute, goal, self._together)
             self.goal = goal
         self._goals.append(goal)

@@ -54,7 +54,7 @@ class IdleDraws:
         """Yield statements that are only an expression, such as `a * b` or `a == b` instead of an assignment."""
         for function in self.noted.functions:
             for node in ast.walk(function):
-                if isinstance(node, ast.Expr) and isinstance(node.value, ast.BinOp | ast.Compare | ast.BoolOp):
+                if isinstance(node, ast.Expr) and _is_lost(node.value):
                     what = f"{write_code(node)}: it is computed, and nothing gets it"
                     yield FaultyCode(node, what, self.source.find_place(node))
 
@@ -195,6 +195,13 @@ class IdleDraws:
                 return False
             moving |= len({_pay(moment) for moment in one[1:]}) > len(one) // 2
         return moving
+
+
+def _is_lost(node: ast.expr) -> bool:
+    """Say whether nothing gets what an operator computes; `done and self.log()` is a condition of a call."""
+    if isinstance(node, ast.BoolOp):
+        return not any(isinstance(part, ast.Call | ast.NamedExpr) for one in node.values[1:] for part in ast.walk(one))
+    return isinstance(node, ast.BinOp | ast.Compare)
 
 
 def _thaw(value: Value) -> Any:

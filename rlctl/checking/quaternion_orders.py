@@ -205,7 +205,7 @@ def _read_products(left: ast.expr, right: ast.expr) -> tuple[ast.expr | None, fr
 def read_turned(node: ast.AST) -> tuple[ast.expr, tuple[str, str]] | None:
     """Return a quaternion whose elements are put into another order, that which it has, and that which it gets."""
     match node:
-        case ast.Subscript(value=owner, slice=ast.List() | ast.Tuple() as index):
+        case ast.Subscript(value=owner, slice=ast.List() | ast.Tuple() as index) if index.elts:
             places = index.elts[-1].elts if isinstance(index.elts[-1], ast.List) else index.elts
             found = tuple(one.value for one in places if isinstance(one, ast.Constant))
             return (owner, TURNED[found]) if found in TURNED and isinstance(node.ctx, ast.Load) else None

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -53,9 +54,8 @@ class RewardReader:
         """The summands, in the order in which they are written."""
         found: list[Summand] = []
         for place in self._list_rewards():
-            for summand in self._expand(place, 1.0, "", ()):
-                if len(found) < MOST_SUMMANDS:
-                    found.append(summand)
+            found += itertools.islice(self._expand(place, 1.0, "", ()), MOST_SUMMANDS - len(found))
+            self._path.clear()  # of what was cut off
         for key, place, conditions in self._list_terms():
             weight = float(self.weights.get(key, math.nan))
             found += self._expand(place, weight, key, conditions)

@@ -65,8 +65,15 @@ def list_float_parts(leaves: Sequence[Leaf]) -> list[tuple[str, int]]:
 
 
 def flatten_floats(leaves: Sequence[Leaf], observation: Any) -> NDArray[np.float64]:
-    """Return the numbers of an observation that rules read, shape (elements,)."""
-    parts = [np.ravel(pick(observation, leaves[index].path)) for index in find_float_leaves(leaves)]
+    """Return the numbers of an observation that rules read, shape (elements,).
+
+    Raises `NotJudged` for an observation that does not have them.
+    """
+    try:
+        picked = [pick(observation, leaves[index].path) for index in find_float_leaves(leaves)]
+        parts = [np.ravel(np.asarray(part, np.float64)) for part in picked]
+    except (LookupError, TypeError, ValueError):
+        raise NotJudged("an observation does not fit its space (RL101)") from None
     return np.concatenate([np.zeros(0), *parts])
 
 

@@ -103,7 +103,7 @@ def _list_uses(source: SourceCode, function: Function, name: str, size: int) -> 
 
 def read_elements(index: ast.expr, size: int) -> list[int] | None:
     """Return which elements an index takes, the last axis being that of the action; None for what is not constant."""
-    if isinstance(index, ast.Tuple):
+    if isinstance(index, ast.Tuple) and index.elts:
         last = index.elts[-1]
         is_worlds = all(isinstance(one, ast.Slice) or _is_ellipsis(one) for one in index.elts[:-1])
         return read_elements(last, size) if is_worlds else None

@@ -157,15 +157,12 @@ class Attribute:
 
     def assign(self, value: Any) -> None:
         """Replace the value in the environment."""
-        value = copy.deepcopy(value)
+        value = _copy(value)
         if self.item is not None:
             whole = self._read_whole()
             items = [*whole[: self.item], value, *whole[self.item + 1 :]]
             value = _join_items(whole, items)
-        if isinstance(self.owner, dict):
-            self.owner[self.key] = value
-        else:
-            setattr(self.owner, self.key, value)
+        self._holder[self.key] = value
 
     def read(self) -> Any:
         """Return the present value in the environment; raises `LookupError` where it is gone."""
@@ -173,7 +170,12 @@ class Attribute:
         return whole if self.item is None else whole[self.item]
 
     def _read_whole(self) -> Any:
-        return (self.owner if isinstance(self.owner, dict) else vars(self.owner))[self.key]
+        return self._holder[self.key]
+
+    @property
+    def _holder(self) -> dict[str, Any]:
+        """Where the owner holds it: an object that may be frozen refuses to be assigned to."""
+        return self.owner if isinstance(self.owner, dict) else vars(self.owner)
 
 
 def read_attributes(env: Any) -> dict[str, Attribute]:
@@ -189,12 +191,12 @@ def read_attributes(env: Any) -> dict[str, Attribute]:
                 continue
             path = f"{name}[{key!r}]" if isinstance(owner, dict) else f"{name}.{key}"
             if _is_quantity(value) or (isinstance(value, Generator) and id(value) not in NO_GENERATORS):
-                value = value if isinstance(value, Generator) else copy.deepcopy(value)
+                value = value if isinstance(value, Generator) else _copy(value)
                 attributes[path] = Attribute(path, owner, key, value)
             elif isinstance(value, list | tuple) and 0 < len(value) <= MOST_ITEMS:
                 items_of_value = [(i, item) for i, item in enumerate(value) if _is_quantity(item)]
                 for i, item in items_of_value if len(items_of_value) == len(value) else ():
-                    attributes[f"{path}[{i}]"] = Attribute(f"{path}[{i}]", owner, key, copy.deepcopy(item), i)
+                    attributes[f"{path}[{i}]"] = Attribute(f"{path}[{i}]", owner, key, _copy(item), i)
             elif depth < DEEPEST and id(value) not in seen and (isinstance(value, dict) or is_own_object(value)):
                 visit(value, path, depth + 1)
 
@@ -204,13 +206,18 @@ def read_attributes(env: Any) -> dict[str, Attribute]:
 
 def _is_quantity(value: Any) -> bool:
     if isinstance(value, NUMBERS):
-        return True
+        return fits_float(value)
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biuf" and 0 < value.size <= MOST_NUMBERS
     if not isinstance(value, list | tuple | collections.deque) or not 0 < len(value) <= MOST_NUMBERS:
         return False
-    shapes = [np.shape(item) for item in value if isinstance(item, (*NUMBERS, np.ndarray))]
+    shapes = [np.shape(item) for item in value if isinstance(item, (*NUMBERS, np.ndarray)) and fits_float(item)]
     return len(shapes) == len(value) and len(set(shapes)) == 1 and len(shapes) * math.prod(shapes[0]) <= MOST_NUMBERS
+
+
+def fits_float(value: Any) -> bool:
+    """Say whether a value is no whole number of hundreds of digits."""
+    return not isinstance(value, int) or abs(value) <= sys.float_info.max
 
 
 def is_own_object(value: Any) -> bool:
@@ -231,8 +238,19 @@ def shape_like(value: Any, numbers: NDArray[np.float64]) -> Any:
 
 
 def _join_items(like: Any, items: Sequence[Any]) -> Any:
-    """Return items in a list or a tuple of the type of another one, which may have named fields."""
-    return type(like)(*items) if hasattr(like, "_fields") else type(like)(items)
+    """Return items in a list, a tuple or a queue of the type of another one, whatever its own constructor takes."""
+    if isinstance(like, tuple):
+        return tuple.__new__(type(like), items)
+    joined = copy.copy(like)  # a queue keeps its length
+    joined.clear()
+    joined.extend(items)
+    return joined
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, list | tuple | collections.deque):
+        return _join_items(value, [copy.deepcopy(item) for item in value])
+    return copy.deepcopy(value)
 
 
 def find_unequal(one: Mapping[str, Attribute], two: Mapping[str, Attribute]) -> list[str]:

@@ -103,6 +103,17 @@ class SkiffKnowsItsCourse(Skiff):
         self.way = self.way / (0.1 + np.linalg.norm(self.gates[-1] - self.gates[0]))
 
 
+class SkiffTellsOfGates(Skiff):
+    """A line of it is a condition of a call."""
+
+    def tell(self):
+        self.told = self.gate
+
+    def move(self, action):
+        super().move(action[()])
+        self.gate > 0 and self.tell()
+
+
 class RL842SkiffWithoutCurrent(Skiff):
     def drift(self):
         return 0.0

@@ -258,6 +258,21 @@ class PuckLooks(Wanted, Puck):
         return super().size() + 2
 
 
+class PuckBesideAWall(RL123PuckNorth):
+    """Some resets let a wall rise out of the ground."""
+
+    def __init__(self):
+        super().__init__()
+        wall = p.createCollisionShape(p.GEOM_BOX, halfExtents=[0.1, 1, 1], physicsClientId=self.client)
+        self.wall = p.createMultiBody(0, wall, basePosition=[9, 0, -2], physicsClientId=self.client)
+        self.state = p.saveState(physicsClientId=self.client)
+
+    def start(self):
+        super().start()
+        height = self.np_random.choice([0.5, -2.0])
+        p.resetBasePositionAndOrientation(self.wall, [9, 0, height], [0, 0, 0, 1], physicsClientId=self.client)
+
+
 class RL618PuckLooksRound(RoundAndRound, PuckLooks): ...
 
 

@@ -1,6 +1,7 @@
 """What the functions of a source assign, and what its names, parameters and calls stand for."""
 
 import ast
+import importlib
 
 import gymnasium
 import pytest
@@ -9,6 +10,7 @@ from rlctl.checking.assignments import list_assignments, list_values, peel, read
 from rlctl.checking.definitions import Definitions, ReadExpression
 from rlctl.checking.expressions import record_expressions
 from rlctl.checking.source_code import SourceCode
+from rlctl.checking.summands import RewardReader
 
 
 class Slider(gymnasium.Env):
@@ -121,3 +123,27 @@ def test_conversions(text, inner):
 def test_names_and_keys():
     assert [read_name(read(text)) for text in ("a.b", "float(a.b)", "f(x)", "a['c'][0]")] == ["b", "b", "f", "c"]
     assert [read_key(read(text)) for text in ("self.a.b[0]", "a", "state['c']")] == ["a.b", "", "c"]
+
+
+LINES = 40
+
+
+def write_long_source(path):
+    """Write functions that each call the eight next ones, and a reward of which each of many conditions leaves half."""
+    calls = [f"self.h{i}()" for i in range(LINES + 8)]
+    functions = [f"    def h{i}(self):\n        self.x{i} = {' + '.join(calls[i + 1 : i + 9])}\n" for i in range(LINES)]
+    halves = [f"        if action > {i}:\n            reward = 0.5 * reward + self.x{i}\n" for i in range(LINES)]
+    step = ["    def step(self, action):\n        reward = 0.0\n", *halves]
+    end = "        self.h0()\n        return 0.0, reward, False, False, {}\n"
+    path.write_text("".join(["import gymnasium\n\n\nclass Long(gymnasium.Env):\n", *functions, *step, end]))
+
+
+def test_a_long_source_is_read_in_a_time_that_grows_with_its_length(tmp_path, monkeypatch):
+    write_long_source(tmp_path / "long_source.py")
+    monkeypatch.syspath_prepend(tmp_path)
+    definitions = Definitions(SourceCode(importlib.import_module("long_source").Long()), [])
+    (step,) = definitions.functions["step"]
+    # Four calls deep, each function has the four after it and those that they call: 4 * 8 after h0.
+    assert definitions.list_sets(step) == {f"x{i}" for i in range(3 * 8 + 1)}
+    assert definitions.list_sets.cache_info().misses <= 4 * LINES
+    assert len(RewardReader(definitions, [], {}).summands) > 1

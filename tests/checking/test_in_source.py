@@ -165,7 +165,7 @@ SOUND = {
     "broken_exchanged.py": ["BoatLooksBack"],
     "broken_fields.py": ["RamApart", "RamOtherNames"],
     "broken_frames.py": ["BargeTurnsInPartsOfATurn"],
-    "broken_idle.py": ["SkiffKnowsItsCourse"],
+    "broken_idle.py": ["SkiffKnowsItsCourse", "SkiffTellsOfGates"],
     "broken_late.py": ["CrabSteersByIt", "CrabKeepsAView", "CrabKeepsTime", "SnailRemembers", "SnailGains"],
     "broken_parts.py": ["BoatStartsItsEngine", "BoatBrakes", "BoatSaturates"],
     "broken_previous.py": ["BoatRestOfCourse"],

@@ -1,5 +1,7 @@
 """RL124, RL125, RL129, RL701, RL834, RL835, RL840, RL843: vectors turned, elements read, ids compared, by lines."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from rlctl.checking.check import judge
@@ -7,6 +9,7 @@ from rlctl.checking.experiments.expressions import BY_EXPRESSIONS
 from rlctl.checking.records import Records
 from rlctl.checking.rule import RuleFinding
 from rlctl.checking.rule_index import RULES
+from rlctl.checking.rules.rl840_two_motors_of_one_joint import _find_doubled_joints
 from tests.checking.judging import case, check_case, findings, found_in_source, mark_slow
 
 TURNED = {
@@ -95,3 +98,17 @@ def test_a_line_is_not_reported_where_an_experiment_has_shown_the_same():
     assert [finding.message for finding in judge(records, ["RL129"]).findings] == ["a line"]
     records.findings.append(RuleFinding(RULES["RL124"], "elements of the observation"))
     assert judge(records, ["RL129"]).findings == []
+
+
+PUSHED = """<mujoco><worldbody><body><joint name="slide" type="slide" axis="1 0 0"/><geom size=".1"/>
+<body><joint name="pole"/><geom type="capsule" fromto="0 0 0 0 0 .5" size=".02"/></body></body></worldbody><actuator>
+<motor name="left" joint="slide" gear="10" ctrlrange="LEFT"/>
+<motor name="right" joint="slide" gear="-10" ctrlrange="0 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("left", "expected"), [("0 1", []), ("-1 1", ["RL840"])])
+def test_motors_that_push_against_each_other_are_meant(left, expected):
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(PUSHED.replace("LEFT", left))
+    env = SimpleNamespace(model=model, data=mujoco.MjData(model))
+    assert [finding.rule for finding in _find_doubled_joints(SimpleNamespace(env=env))] == expected

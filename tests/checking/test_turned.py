@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.checking.judging import case, check_case, findings, found, mark_slow
+from tests.checking.judging import case, check_case, findings, found, mark_slow, verdict_of
 
 pytest.importorskip("mujoco")
 
@@ -62,3 +62,10 @@ def test_a_large_box_is_level_ground_for_feet_that_begin_in_it():
 def test_bumps_are_no_level_ground():
     # MuJoCo's models of tasks list which geoms touch, in pairs.
     assert found("walk-rough", "RL123") == set()
+
+
+@pytest.mark.slow
+@pytest.mark.pybullet
+def test_a_robot_that_a_later_reset_puts_beside_a_wall_is_not_judged():
+    verdict = verdict_of("broken_turned.py:PuckBesideAWall", "RL123")
+    assert verdict.not_judged["RL123"] == "not each reset puts the robot on level ground"

@@ -274,6 +274,12 @@ def test_results_have_the_mean_of_seeds_and_name_the_unfinished(write_run):
     assert "50 \\% (1 unfinished) & 2 & " in latex
 
 
+def test_a_file_of_markdown_is_markdown(group):
+    text = write(group[0], target=Path("report.md"))
+    assert "| steps |" in text
+    assert "<html" not in text
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -15,6 +15,7 @@ from rlctl.checking.audit.play_world import COMMANDED, Array, PlayedEpisode, Pla
 from rlctl.checking.episode import action_at, find_action_range
 from rlctl.checking.instance import Context, EnvironmentRaised, Instance
 from rlctl.checking.records import FIRST_SEED
+from rlctl.checking.rule import NotJudged
 from rlctl.environments.info import describe_worlds
 from rlctl.environments.leaves import find_leaves
 from rlctl.policy.actor import Actor, Rows, act_one_by_one
@@ -52,7 +53,7 @@ class Plays:
             return None
         try:
             return leading.find_lead(self.context)
-        except EnvironmentRaised:  # its goal is moved where it may never be
+        except (EnvironmentRaised, NotJudged):  # its goal is moved where it may never be; time ran out
             return None
 
     @functools.cached_property

@@ -29,6 +29,7 @@ from rlctl.checking.values import (
     Attribute,
     find_author,
     find_numbers,
+    fits_float,
     flatten_action,
     list_own_classes,
     parse_sources,
@@ -272,7 +273,7 @@ def find_weights(env: Any) -> set[float]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_)
+    return isinstance(value, NUMBERS) and not isinstance(value, bool | np.bool_) and fits_float(value)
 
 
 def _find_literals(env: Any) -> set[float]:

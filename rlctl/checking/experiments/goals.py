@@ -93,6 +93,8 @@ def find_drawn_goal(context: Context, places: Sequence[DrawnPlace]) -> DrawnGoal
                     break
                 instance.reset(seed)
                 goals[seed] = place.read(instance.env).tolist()
+            if not goals:
+                raise NotJudged(context.budget.why_spent())
             return DrawnGoal(place, copies, turned, goals, _find_reaches(instance, place, copies), scales, pose)
     return None
 
@@ -218,7 +220,7 @@ def _find_pose(instance: Instance, place: DrawnPlace) -> SeenPose | None:
     size = place.size - 1
     plain = _observe(instance, place, 0.0)
     shifted = [_observe(instance, place, 1.0, TURN_SHIFT * axis) for axis in np.eye(place.size)]
-    if size < 1 or any(row.shape != plain.shape for row in shifted):
+    if size < 1 or not plain.size or any(row.shape != plain.shape for row in shifted):
         return None
     changes = np.stack([row - plain for row in shifted]) / TURN_SHIFT  # shape (size + 1, elements)
     rounding = TURN_ERROR + SAME_ANGLE * np.abs(plain).max() / TURN_SHIFT

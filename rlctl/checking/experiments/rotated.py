@@ -74,7 +74,9 @@ def rotate_world(context: Context) -> Iterator[ChildMessage]:
     if base is None and has_engine(instance):
         raise NotApplicable("no robot that turns about a hinge on the world, or without an engine")
     first = _play(instance, 0, (), None, 0.0)
-    if not _are_same(first, _play(instance, 0, (), None, 0.0)) or not first.observed.size:
+    if not first.observed.size:
+        raise NotApplicable("nothing that is observed is a real number")
+    if not _are_same(first, _play(instance, 0, (), None, 0.0)):
         raise NotJudged("an episode with the same seed and actions is not the same again (RL302)")
     vectors = find_vectors(_read_states(instance))
     angles = [] if base is not None else _find_angles(instance, first)

@@ -72,6 +72,8 @@ class SumTrials:
             commands.append(self._read_commands())
             if moment.step:
                 taken.append(flatten_action(self.instance.action_leaves, moment.action))
+        if len({row.size for row in values}) > 1:
+            raise NotJudged("the observation has more than one size (RL101)")
         sizes = [len(row) for row in commands]
         rows = [row if len(row) == max(sizes) else np.full(max(sizes), np.nan) for row in commands]
         return PlayedSums(np.array(values), np.array(rows), np.array(taken))

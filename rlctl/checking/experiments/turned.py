@@ -150,6 +150,14 @@ def _find_free_bodies(clients: Iterable[int]) -> list[tuple[ClientCalls, int]]:
     return found
 
 
+def _require_free_body(instance: Instance) -> tuple[ClientCalls, int]:
+    """Return the free body of PyBullet; raises `NotJudged` where another reset has put it beside something higher."""
+    found = _find_free_bodies(instance.find_clients())
+    if not found:
+        raise NotJudged("not each reset puts the robot on level ground")
+    return found[0]
+
+
 def _is_level_plane(p: ClientCalls, body: int) -> bool:
     """Say whether a body of PyBullet is a plane or a box that goes on as far as any robot, and not tilted."""
     low, high = p.getAABB(body)
@@ -163,7 +171,7 @@ def _turn(instance: Instance, angle: float, speed: float, lift: float, spin: flo
     """Turn the free robot about the vertical, lift it, and change its velocities; return its heading [rad]."""
     if (simulation := find_mujoco(instance.env)) is not None:
         return _turn_in_mujoco(*simulation, angle, speed, lift, spin)
-    (p, body), *_ = _find_free_bodies(instance.find_clients())
+    p, body = _require_free_body(instance)
     place, orientation = p.getBasePositionAndOrientation(body)
     linear, angular = p.getBaseVelocity(body)
     turn = from_axis(UP, angle)
@@ -198,6 +206,6 @@ def _read_velocity(instance: Instance) -> complex:
         (joint,) = np.flatnonzero(model.jnt_type == FREE)
         x, y = data.qvel[model.jnt_dofadr[joint] :][:2]
     else:
-        (p, body), *_ = _find_free_bodies(instance.find_clients())
+        p, body = _require_free_body(instance)
         x, y, _ = p.getBaseVelocity(body)[0]
     return complex(x, y)

@@ -51,7 +51,7 @@ def change_attributes(context: Context) -> Iterator[ChildMessage]:
                 continue
             if is_previous_key(name):
                 yield _count_from_start(instance, name, plain, frames)
-            elif _is_shown(instance, name):
+            elif _is_shown(instance, name, other.numbers.shape):
                 continue
             else:
                 yield _hidden(instance, name, plain, frames)
@@ -86,12 +86,14 @@ def _hides(plain: Sequence[Frame], changed: Sequence[Frame]) -> bool:
     return steps >= FEWEST_COMPARED and only_reward and len(differences) > steps // 2
 
 
-def _is_shown(instance: Instance, name: str) -> bool:
+def _is_shown(instance: Instance, name: str, shape: tuple[int, ...]) -> bool:
     rows, values = [], []
     for number in range(REGRESSED_RESETS):
         start = EpisodePlayer(instance, FIRST_SEED + number, max_steps=0).reset()
-        rows.append(flatten(start.observation).astype(np.float64))
-        values.append(read_attributes(instance.env)[name].numbers)
+        attribute = read_attributes(instance.env).get(name)
+        if attribute is not None and attribute.numbers.shape == shape:  # a reset may draw how many there are
+            rows.append(flatten(start.observation).astype(np.float64))
+            values.append(attribute.numbers)
     return explains(np.nan_to_num(np.stack(rows)), np.stack(values))
 
 

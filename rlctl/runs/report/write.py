@@ -23,7 +23,7 @@ PICTURES: tuple[Literal["svg", "pdf", "png"], ...] = ("svg", "pdf", "png")  # fo
 
 
 ReportForm = Literal["html", "md", "table", "csv", "latex", "svg", "pdf", "png"]
-_SUFFIXES: dict[str, ReportForm] = {".html": "html", ".csv": "csv", ".tex": "latex"}
+_SUFFIXES: dict[str, ReportForm] = {".html": "html", ".md": "md", ".csv": "csv", ".tex": "latex"}
 _SUFFIXES |= {f".{form}": form for form in PICTURES}
 _EPISODES = 100
 
@@ -69,7 +69,8 @@ def _choose_form(form: ReportForm | None, target: Path | None) -> ReportForm:
     suffix = None if target is None else _SUFFIXES.get(target.suffix)
     if form is None:
         return suffix or "html"
-    if suffix is not None and suffix != form:
+    is_markdown = form == "table" and suffix == "md"
+    if suffix is not None and suffix != form and not is_markdown:
         raise UsageError(f"--output {target} is the name of another format than --format {form}: leave one of them out")
     return form
 
