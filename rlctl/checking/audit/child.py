@@ -67,7 +67,7 @@ def play_rounds(
                     yield Skipped(competitor.name, f"raised {error}")
                     if failures >= MOST_FAILURES:
                         return
-                except RlctlError as error:
+                except (RlctlError, NotJudged) as error:
                     yield Skipped(competitor.name, str(error))
     finally:
         plays.close()

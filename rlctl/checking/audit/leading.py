@@ -87,14 +87,15 @@ class _Coming:
 
     def start(self) -> None:
         """Note what was drawn."""
-        self._drawn = self._place.find(self._env)
+        self._attribute = self._place.find(self._env)
+        self._drawn = self._place.pick(self._attribute)
 
     def move(self, step: int) -> None:
         """Put the goal where it should be after a step."""
         left = max(self._part, 1.0 - step / self._approach)
-        way = self._place.pick(self._drawn) - self._trace[0]
         there = self._trace[min(step, len(self._trace)) - 1]
-        self._place.assign(self._drawn, there + left * way, together=True)
+        self._attribute = self._place.find_again(self._attribute, self._env)
+        self._place.assign(self._attribute, there + left * (self._drawn - self._trace[0]), together=True)
 
 
 def find_lead(context: Context) -> Lead | None:
