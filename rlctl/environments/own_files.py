@@ -67,7 +67,7 @@ def _list_needed(file: Path, top: Path, _changed: int, size: int) -> tuple[Path,
         text = file.read_text()
         named = _list_of_source(ast.parse(text), file, top) if file.suffix == ".py" else _list_of_model(text, file)
         return tuple(path.resolve() for path in named if path.is_file() and path.resolve().is_relative_to(top))
-    except (OSError, ValueError, SyntaxError, RecursionError):
+    except (IndexError, OSError, ValueError, SyntaxError, RecursionError):  # an index: `from .....` above all folders
         return ()
 
 

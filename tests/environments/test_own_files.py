@@ -79,3 +79,8 @@ def test_a_changed_model_is_named(robot, task):
 
 def test_of_rlctls_own_tasks_the_version_says_it():
     assert registry.identify_files("reach") == {}
+
+
+def test_an_import_from_above_all_folders_is_left_out(robot):
+    (robot / "gains.py").write_text(f"from {'.' * 40} import pi\n")
+    assert "robot/gains.py" in digest_own_files(robot / "env.py")

@@ -74,6 +74,7 @@ def _average(runs: Sequence[ResultRow]) -> ResultRow:
     scored = [run for run in runs if run.mean_return is not None]
     successes = [run.success for run in scored if run.success is not None]
     returns = [run.mean_return for run in scored if run.mean_return is not None]
+    minutes = [run.minutes for run in runs if run.minutes is not None]
     unfinished = sum(run.state != "done" for run in runs)
     success_interval = None
     if successes:
@@ -86,7 +87,7 @@ def _average(runs: Sequence[ResultRow]) -> ResultRow:
         seeds=len(scored),
         state=f"{unfinished} unfinished" if unfinished else "done",
         steps=min((run.steps for run in runs if run.steps is not None), default=None),
-        minutes=sum(run.minutes for run in runs if run.minutes is not None),
+        minutes=sum(minutes) if minutes else None,
         success=float(np.mean(successes)) if successes else None,
         success_interval=success_interval,
         mean_return=float(np.mean(returns)) if returns else None,
