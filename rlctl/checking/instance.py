@@ -98,6 +98,11 @@ def display_error(failure: CallFailure) -> str:
     return next((line.strip() for line in lines if NO_DISPLAY.search(line)), "")
 
 
+def lacks_display(error: str) -> bool:
+    """Say whether an exception says that a window cannot be opened; one about OpenGL may come from a picture."""
+    return bool(NO_DISPLAY.search(error)) and not opengl_fix(error)
+
+
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:
     """Describe the file behind an exception, or behind what caused it; None if it is about something else."""
     for cause in get_causes(error):

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 
 from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.experiments.build import FailedBuild, explains_failures, judges_built
-from rlctl.checking.instance import Instance, display_error
+from rlctl.checking.failures import select_failures
+from rlctl.checking.instance import Instance, display_error, lacks_display
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
-from rlctl.errors import NoDisplayError
+from rlctl.errors import NoDisplayError, read_message
 
 RULE = Rule(
     "RL216",
@@ -30,6 +31,8 @@ RULE = Rule(
 def _explain_no_display(failed: FailedBuild) -> Iterator[RuleFinding]:
     if isinstance(failed.error, NoDisplayError):
         yield RuleFinding(RULE, failed.message)
+    elif failed.cause is not None and lacks_display(read_message(failed.cause)):
+        yield RuleFinding(RULE, f"{failed.message}: it opens a window", failed.details, where=failed.where)
 
 
 @judges_built(RULE)
@@ -45,5 +48,9 @@ def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if line := display_error(failure):
             yield RuleFinding(RULE, f"{failure.message}, because there is no display: {line!r}", failure.place)
+            return
+    for failure in select_failures(records, "raised"):
+        if lacks_display(failure.error):
+            yield RuleFinding(RULE, f"{failure.message}: it opens a window", failure.place, where=failure.where)
             return
     records.require_built()
