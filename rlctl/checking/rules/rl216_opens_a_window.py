@@ -21,7 +21,8 @@ RULE = Rule(
     """,
     fix="""
         Let render_mode be None by default, and open windows for "human" only. With PyBullet - p.connect(p.GUI
-        if render_mode == "human" else p.DIRECT).
+        if render_mode == "human" else p.DIRECT). Where the constructor takes render_mode, --set task.render_mode=null
+        checks the rest before that.
     """,
     needs_instance=False,
 )
