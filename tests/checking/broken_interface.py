@@ -116,11 +116,15 @@ class WindowByDefault(DrawsInWindow):
         super().__init__(render_mode)
 
 
+class NoSuchDisplayException(Exception):
+    """As of pyglet, whose message does not name the display."""
+
+
 class WindowInConstructor(Renders):
     def __init__(self, render_mode="human"):
         super().__init__(render_mode)
         if render_mode == "human":
-            raise RuntimeError("no display name and no $DISPLAY environment variable")
+            raise NoSuchDisplayException('Cannot connect to "None"')
 
 
 class ForgetsSeed(Clean):

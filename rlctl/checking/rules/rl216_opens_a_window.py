@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.experiments.build import FailedBuild, explains_failures, judges_built
 from rlctl.checking.failures import select_failures
-from rlctl.checking.instance import Instance, display_error, lacks_display
+from rlctl.checking.instance import Instance, describe, display_error, lacks_display
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
-from rlctl.errors import NoDisplayError, read_message
+from rlctl.errors import NoDisplayError
 
 RULE = Rule(
     "RL216",
@@ -32,7 +32,9 @@ RULE = Rule(
 def _explain_no_display(failed: FailedBuild) -> Iterator[RuleFinding]:
     if isinstance(failed.error, NoDisplayError):
         yield RuleFinding(RULE, failed.message)
-    elif failed.cause is not None and lacks_display(read_message(failed.cause)):
+    elif failed.cause is None or failed.context.progress.read().call == "load":  # RL001
+        return
+    elif lacks_display(describe(failed.cause)):
         yield RuleFinding(RULE, f"{failed.message}: it opens a window", failed.details, where=failed.where)
 
 
