@@ -65,7 +65,7 @@ def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFa
     place = (error.call, at.phase, at.episode, at.seed, at.step)
     trace, file = "".join(traceback.format_exception(cause)), find_missing_file(cause)
     text = describe(cause)
-    fix = opengl_fix(text) or mujoco_fix(cause)
+    fix = opengl_fix(text) or mujoco_fix(cause) or warning_fix(cause)
     return CallFailure("raised", *place, text, trace, file, find_line(cause), fix=fix)
 
 
@@ -90,6 +90,12 @@ def describe(error: BaseException) -> str:
     place = f" ({format_place(*where)})" if where else ""
     text = " ".join(read_message(error).split()) or "no message"
     return f"{name_kind(error)}: {text}{place}{advise(error)}"
+
+
+def warning_fix(error: BaseException) -> str:
+    """Return what to do about a warning that a filter makes an exception; empty for other exceptions."""
+    cause = 'an imported package calls warnings.filterwarnings("error"), or Python runs with -W error'
+    return f"It is a warning that a filter makes an exception: {cause}." if isinstance(error, Warning) else ""
 
 
 def display_error(failure: CallFailure) -> str:
