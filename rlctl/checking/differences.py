@@ -49,15 +49,16 @@ class FirstDifference:
 
 
 def compare(records: Records, first: str, second: str) -> FirstDifference | None:
-    """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised."""
+    """Compare two recordings of an episode; raises `NotJudged` where one is missing, or raised before they differ."""
     if not records.require_built().accepts_seed:
         raise NotJudged("reset takes no seed (RL202)")
     a, b = records.require_role(first), records.require_role(second)
-    if "raised" in (a.ended, b.ended):
+    difference = find_difference(records, a, b)
+    if difference is None and "raised" in (a.ended, b.ended):
         raise NotJudged("the episode failed (RL201, RL207)")
-    if not any(series.values.size for series in a.observations.values()):
+    if difference is None and not any(series.values.size for series in a.observations.values()):
         raise NotJudged("no observation could be compared")
-    return find_difference(records, a, b)
+    return difference
 
 
 def require_independent(records: Records) -> None:

@@ -65,7 +65,7 @@ def describe_failure(error: EnvironmentRaised, progress: CallProgress) -> CallFa
     place = (error.call, at.phase, at.episode, at.seed, at.step)
     trace, file = "".join(traceback.format_exception(cause)), find_missing_file(cause)
     text = describe(cause)
-    fix = opengl_fix(text) or mujoco_fix(cause)
+    fix = opengl_fix(text) or mujoco_fix(cause) or warning_fix(cause)
     return CallFailure("raised", *place, text, trace, file, find_line(cause), fix=fix)
 
 
@@ -92,10 +92,21 @@ def describe(error: BaseException) -> str:
     return f"{name_kind(error)}: {text}{place}{advise(error)}"
 
 
+def warning_fix(error: BaseException) -> str:
+    """Return what to do about a warning that a filter makes an exception; empty for other exceptions."""
+    cause = 'an imported package calls warnings.filterwarnings("error"), or Python runs with -W error'
+    return f"It is a warning that a filter makes an exception: {cause}." if isinstance(error, Warning) else ""
+
+
 def display_error(failure: CallFailure) -> str:
     """Return the line that a process printed which ended because it has no display; empty for other failures."""
     lines = (failure.details or "").splitlines() if failure.kind == "died" else []
     return next((line.strip() for line in lines if NO_DISPLAY.search(line)), "")
+
+
+def lacks_display(error: str) -> bool:
+    """Say whether an exception says that a window cannot be opened; one about OpenGL may come from a picture."""
+    return bool(NO_DISPLAY.search(error)) and not opengl_fix(error)
 
 
 def find_missing_file(error: BaseException | None) -> dict[str, Any] | None:

@@ -98,6 +98,35 @@ class GuiInReset(Clean):
         pybullet.connect(pybullet.GUI)
 
 
+class DrawsInWindow(Renders):
+    """Opens its window in reset, for "human" only: nothing is wrong with it."""
+
+    def start(self):
+        super().start()
+        if self.render_mode == "human":
+            self.open_window()
+
+    def open_window(self):
+        """Fails as pygame, Tk and pyglet do, which raise where there is no display."""
+        raise RuntimeError("No available video device")
+
+
+class WindowByDefault(DrawsInWindow):
+    def __init__(self, render_mode="human"):
+        super().__init__(render_mode)
+
+
+class NoSuchDisplayException(Exception):
+    """As of pyglet, whose message does not name the display."""
+
+
+class WindowInConstructor(Renders):
+    def __init__(self, render_mode="human"):
+        super().__init__(render_mode)
+        if render_mode == "human":
+            raise NoSuchDisplayException('Cannot connect to "None"')
+
+
 class ForgetsSeed(Clean):
     def reset(self, *, seed=None, options=None):
         return super().reset(options=options)

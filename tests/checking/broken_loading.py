@@ -1,6 +1,7 @@
 """Environments that cannot be built, or say the wrong things about themselves."""
 
 import contextlib
+import warnings
 
 from broken_envs import Clean
 
@@ -17,6 +18,14 @@ class RL002Raising(Clean):
 class UnreadableError(Exception):
     def __str__(self):
         raise RuntimeError("no text")
+
+
+class WarnsWhereWarningsAreErrors(Clean):
+    def __init__(self):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # as a package does when it is imported
+            warnings.warn("path is deprecated", DeprecationWarning, stacklevel=1)
+        super().__init__()
 
 
 class RL002RaisingUnreadably(Clean):

@@ -8,6 +8,29 @@ from gymnasium import spaces
 from mujoco_robots import ARM, HOPPER, SIDES, MujocoArm, MujocoHopper
 from scipy.spatial.transform import Rotation
 
+# RL103
+
+
+class ArmSpaceOfRanges(MujocoArm):
+    """Its wrist has no limits, and its space takes each range from the model."""
+
+    xml = ARM.replace('axis="1 0 0" range="-170 170"', 'axis="1 0 0"')
+
+    def __init__(self):
+        super().__init__()
+        bounds = np.concatenate([self.list_ranges(), np.full((6, 2), [-np.inf, np.inf])]).astype(np.float32)
+        self.observation_space = spaces.Box(*bounds.T)
+
+    def list_ranges(self):
+        return self.model.jnt_range
+
+
+class ArmSpaceOfLimits(ArmSpaceOfRanges):
+    def list_ranges(self):
+        is_limited = self.model.jnt_limited.astype(bool)[:, None]
+        return np.where(is_limited, self.model.jnt_range, [-np.inf, np.inf])
+
+
 # RL116
 
 

@@ -18,6 +18,18 @@ class RL301RL309GlobalRandom(Clean):
         self.position = np.random.uniform(-1, 1, 2).astype(np.float32)  # noqa: NPY002
 
 
+class RaisesInStep(Clean):
+    """Its steps fail; its reset is right."""
+
+    def move(self, action):
+        raise TypeError("no goal was set")
+
+
+class SamplesTheStart(RaisesInStep):
+    def start(self):
+        self.position = self.observation_space.sample()
+
+
 class RL302NoisyStep(Clean):
     def move(self, action):
         super().move(action + np.float32(0.001 * random.randint(0, 9)))

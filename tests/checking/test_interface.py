@@ -17,6 +17,7 @@ CASES = [
     case(f"{FILE}:RL215RenderNeedsGraphics", ("RL215", "info"), twin=f"{FILE}:Renders"),
     case(f"{FILE}:RL215RenderFloats", ("RL215", "warning"), twin=f"{FILE}:Renders"),
     case(f"{FILE}:RL215RenderNothing", ("RL215", "warning"), twin=f"{FILE}:Renders"),
+    case(f"{FILE}:WindowByDefault", ("RL216", "error"), twin=f"{FILE}:DrawsInWindow"),
     case(f"{FILE}:RL506Falls", ("RL506", "warning"), twin=f"{FILE}:RL506FallsInTime"),
 ]
 
@@ -47,6 +48,17 @@ def test_pictures_are_told():
     assert message.endswith("takes no render_mode")
     (message,) = messages("RL215RenderNothing", "RL215")
     assert message.startswith("with render_mode='rgb_array' render returns a NoneType")
+
+
+def test_a_window_that_raises_is_told_as_a_window():
+    """Not RL207 and RL002, which would advise to repeat the episode or the constructor."""
+    (finding,) = findings(f"{FILE}:WindowByDefault", "RL207", "RL216")
+    assert finding.rule == "RL216"
+    assert finding.message.startswith("reset raised RuntimeError: No available video device (")
+    assert finding.message.endswith("): it opens a window")
+    (finding,) = findings(f"{FILE}:WindowInConstructor", "RL002", "RL216")
+    assert finding.rule == "RL216"
+    assert "NoSuchDisplayException: Cannot connect to" in finding.message
 
 
 @pytest.mark.slow

@@ -68,6 +68,12 @@ def test_an_exception_without_a_readable_message_is_a_finding_of_its_call():
     assert finding.message.startswith("step 1 raised UnreadableError: (message unavailable: RuntimeError)")
 
 
+def test_a_warning_that_a_filter_makes_an_exception_is_explained():
+    (finding,) = findings("broken_loading.py:WarnsWhereWarningsAreErrors", "RL002")
+    assert "DeprecationWarning: path is deprecated" in finding.message
+    assert finding.fix.startswith("It is a warning that a filter makes an exception: ")
+
+
 def test_an_import_names_the_first_error_of_a_chain(tmp_path):
     file = tmp_path / "chained_import.py"
     file.write_text("try:\n    import no_such_module\nexcept ImportError as e:\n    raise RuntimeError('extra') from e")

@@ -183,3 +183,11 @@ def test_fix_speaks_of_the_file_where_the_mistake_is():
     assert "In the XML" in in_file.fix
     assert "np.deg2rad" in in_code.fix
     assert "(likewise" in in_code.message
+
+
+@pytest.mark.slow
+def test_the_range_of_a_joint_without_limits_is_explained():
+    (finding,) = findings("broken_mujoco.py:ArmSpaceOfRanges", "RL103")
+    assert "the space allows [0, 0]" in finding.message
+    assert finding.fix.startswith("Declare infinite bounds")
+    assert findings("broken_mujoco.py:ArmSpaceOfLimits", "RL103") == []

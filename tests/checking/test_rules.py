@@ -340,3 +340,9 @@ def test_every_experiment_has_a_place_of_its_own():
 
 def test_every_rule_is_judged():
     assert {rule for rule in RULES if not find_needs([rule])} == set()
+
+
+def test_a_start_that_no_seed_determines_shows_though_steps_fail():
+    assert ("RL301", "error") in found("broken_repeats.py:SamplesTheStart", "RL301")
+    verdict = verdict_of("broken_repeats.py:RaisesInStep", "RL301")
+    assert (verdict.findings, verdict.not_judged) == ([], {"RL301": "the episode failed (RL201, RL207)"})

@@ -16,6 +16,7 @@ from rlctl.checking.instance import (
     describe,
     find_first_error,
     raised_by_environment,
+    warning_fix,
 )
 from rlctl.checking.records import Built, ChildMessage
 from rlctl.checking.step_source import read_flags
@@ -71,7 +72,7 @@ class FailedBuild:
         """What to do about a library that the error comes from; empty where it is the environment's own."""
         if self.to_install or self.cause is None:
             return self.to_install
-        return opengl_fix(read_message(self.cause)) or mujoco_fix(self.cause)
+        return opengl_fix(read_message(self.cause)) or mujoco_fix(self.cause) or warning_fix(self.cause)
 
     @property
     def where(self) -> tuple[str, int] | None:

@@ -30,6 +30,10 @@ RULE = Rule(
 
 ROUNDING = 1e-6  # Excess over a bound, relative to the bound, up to which it is float rounding
 SLIGHT = 0.01  # the same, relative to the range, up to which it is no error
+UNLIMITED = """
+Declare infinite bounds for an element that has none. In MuJoCo the jnt_range of a joint without limits is [0, 0]:
+jnt_limited says which joints have limits.
+"""
 LARGE_SHARE, SMALL_SHARE = 0.1, 0.005  # of all observations but the last ones, for an error, or a warning
 
 
@@ -60,7 +64,8 @@ def _find_out_of_range(records: Records) -> Iterator[RuleFinding]:
         severity = Severity.WARNING if is_rounding else _severity_of_outside(recorded, outside)
         if severity is Severity.ERROR and _is_slight(leaf, recorded):
             severity = Severity.WARNING
-        yield RuleFinding(RULE, message, evidence, severity)
+        has_no_range = built.model != "" and low == high == 0.0
+        yield RuleFinding(RULE, message, evidence, severity, " ".join(UNLIMITED.split()) if has_no_range else "")
 
 
 def _severity_of_outside(

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 from rlctl.checking.experiment import RECORDING, judges_records
 from rlctl.checking.experiments.build import FailedBuild, explains_failures, judges_built
-from rlctl.checking.instance import Instance, display_error
+from rlctl.checking.failures import select_failures
+from rlctl.checking.instance import Instance, describe, display_error, lacks_display
 from rlctl.checking.records import Records
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.environments.bullet_clients import ClientCalls, find_clients
@@ -20,7 +21,8 @@ RULE = Rule(
     """,
     fix="""
         Let render_mode be None by default, and open windows for "human" only. With PyBullet - p.connect(p.GUI
-        if render_mode == "human" else p.DIRECT).
+        if render_mode == "human" else p.DIRECT). Where the constructor takes render_mode, --set task.render_mode=null
+        checks the rest before that.
     """,
     needs_instance=False,
 )
@@ -30,6 +32,10 @@ RULE = Rule(
 def _explain_no_display(failed: FailedBuild) -> Iterator[RuleFinding]:
     if isinstance(failed.error, NoDisplayError):
         yield RuleFinding(RULE, failed.message)
+    elif failed.cause is None or failed.context.progress.read().call == "load":  # RL001
+        return
+    elif lacks_display(describe(failed.cause)):
+        yield RuleFinding(RULE, f"{failed.message}: it opens a window", failed.details, where=failed.where)
 
 
 @judges_built(RULE)
@@ -45,5 +51,9 @@ def _find_lost_display(records: Records) -> Iterator[RuleFinding]:
     for failure in records.failures:
         if line := display_error(failure):
             yield RuleFinding(RULE, f"{failure.message}, because there is no display: {line!r}", failure.place)
+            return
+    for failure in select_failures(records, "raised"):
+        if lacks_display(failure.error):
+            yield RuleFinding(RULE, f"{failure.message}: it opens a window", failure.place, where=failure.where)
             return
     records.require_built()

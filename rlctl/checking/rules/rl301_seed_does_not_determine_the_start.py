@@ -13,7 +13,8 @@ RULE = Rule(
     Severity.ERROR,
     meaning="Two resets of one instance with one seed give different first observations.",
     fix="""
-        Call super().reset(seed=seed) first, and draw only from self.np_random; use no np.random.*, random.* or time.
+        Call super().reset(seed=seed) first, and draw only from self.np_random; use no np.random.*, random.* or time,
+        and no sample() of a space, which reset does not seed.
     """,
     task_fix="""
         Draw only from `rng`, the argument of reset; use no np.random.*, random.*, default_rng() or time.
