@@ -228,8 +228,7 @@ class GoalEpisode:
     def step(self, goal: Numbers | None = None) -> GoalStep:
         """Set the goal, if one is given, and take a step."""
         if goal is not None:
-            self._place.assign(self._attribute, goal, self._together)
-            self.goal = goal
+            self.goal = self._place.assign(self._attribute, goal, self._together)
         self._goals.append(goal)
         moment = self._player.step()
         self.observed = self._flatten(moment)

@@ -43,6 +43,7 @@ CASES = [
     broken("RL121ArmMovesItsGoal", ("RL121", "warning"), twin="Arm", file=REACH, slow=True),
     broken("RL622ArmKeepsAway", ("RL622", "warning"), twin="Arm", file=REACH, slow=True),
     broken("RL622RoverKeepsAway", ("RL605", "warning"), ("RL622", "warning"), twin="Rover", slow=True),
+    broken("RL622RoverOfFloat32KeepsAway", ("RL605", "warning"), ("RL622", "warning"), twin="Rover", slow=True),
     broken("RL622PlanarArmKeepsAway", ("RL622", "warning"), twin="PlanarArm", file=REACH, slow=True),
     broken("RL622UprightArmKeepsAway", ("RL622", "warning"), twin="UprightArm", file=REACH, slow=True),
     broken("RL622PosedArmKeepsAway", ("RL622", "warning"), twin="PosedArm", file=REACH, slow=True),
