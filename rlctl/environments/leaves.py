@@ -8,6 +8,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 Path = tuple[str | int, ...]
+KNOWN = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,9 @@ def find_leaves(space: Any, path: Path = ()) -> list[Leaf]:
 
 
 def _name_kind(space: Any) -> str:
+    for known in KNOWN:
+        if isinstance(space, known):  # also a class of the environment's own
+            return known.__name__
     kind = type(space)
     if isinstance(space, spaces.Space) or not hasattr(spaces, kind.__name__):
         return kind.__name__

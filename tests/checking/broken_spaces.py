@@ -140,3 +140,13 @@ class RL008ObservationOfGym(Clean):
     def __init__(self):
         super().__init__()
         self.observation_space = OldBox(-self.size, self.size, (2,), np.float32)
+
+
+class OwnBox(spaces.Box):
+    """A box that knows more of its actions, such as their scale."""
+
+
+class RL106OwnBox(Clean):
+    def __init__(self):
+        super().__init__()
+        self.action_space = OwnBox(-1.0, 3.0, (2,), np.float32)

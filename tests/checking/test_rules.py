@@ -47,6 +47,7 @@ CASES = [
     case("broken_spaces.py:RL108TwoAxes", ("RL108", "warning"), twin="broken_spaces.py:RL108FloatTable", slow=True),
     case("broken_spaces.py:RL108Dark", ("RL108", "warning"), twin="broken_spaces.py:RL108Seen", slow=True),
     case("broken_spaces.py:RL106Asymmetric", ("RL106", "warning")),
+    case("broken_spaces.py:RL106OwnBox", ("RL106", "warning")),
     case("broken_spaces.py:RL106Thrust", ("RL106", "info")),
     case("broken_spaces.py:RL109TupleObservation", ("RL109", "warning")),
     case("broken_spaces.py:RL109TextObservation", ("RL109", "warning")),
