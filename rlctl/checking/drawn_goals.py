@@ -69,14 +69,16 @@ class DrawnPlace:
         """Return the place that an attribute has. Shape (size,)."""
         return attribute.numbers[list(self.elements)]
 
-    def assign(self, attribute: Attribute, place: Numbers, together: bool = False) -> None:
+    def assign(self, attribute: Attribute, place: Numbers, together: bool = False) -> Numbers:
         """Replace the place in the environment, and `together` all later goals; the other elements become those of the
-        copy."""
+        copy. Return the place in the environment's own precision. Shape (size,)."""
         numbers = attribute.numbers.copy()
         for elements in [self.elements, *(self.later if together else ())]:
             if max(elements) < numbers.size:  # a reset may draw how many goals there are
                 numbers[list(elements)] = place
-        attribute.assign(shape_like(attribute.value, numbers))
+        kept = shape_like(attribute.value, numbers)
+        attribute.assign(kept)
+        return np.ravel(np.asarray(kept, np.float64))[list(self.elements)]
 
 
 @dataclasses.dataclass(frozen=True)

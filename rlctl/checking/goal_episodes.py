@@ -229,8 +229,7 @@ class GoalEpisode:
         """Set the goal, if one is given, and take a step."""
         if goal is not None:
             self._attribute = self._place.find_again(self._attribute, self._instance.env)
-            self._place.assign(self._attribute, goal, self._together)
-            self.goal = goal
+            self.goal = self._place.assign(self._attribute, goal, self._together)
         self._goals.append(goal)
         moment = self._player.step()
         self.observed = self._flatten(moment)

@@ -227,9 +227,13 @@ def is_own_object(value: Any) -> bool:
 
 
 def shape_like(value: Any, numbers: NDArray[np.float64]) -> Any:
-    """Return numbers in the form of a value: an array, a number, or a list or a tuple of such."""
+    """Return numbers in the form of a value: an array, a number, or a list or a tuple of such; of its precision, since
+    a space of float32 does not contain an array of float64."""
     if isinstance(value, np.ndarray):
-        return numbers.reshape(value.shape)
+        dtype = value.dtype if value.dtype.kind == "f" else numbers.dtype
+        return numbers.reshape(value.shape).astype(dtype)
+    if isinstance(value, np.floating):
+        return value.dtype.type(numbers[0])
     if not isinstance(value, list | tuple | collections.deque):
         return float(numbers[0])
     parts = np.split(numbers, np.cumsum([np.size(item) for item in value])[:-1])

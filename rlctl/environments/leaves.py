@@ -8,6 +8,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 Path = tuple[str | int, ...]
+KNOWN = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,7 +16,7 @@ class Leaf:
     """One array of a space. Every supported kind has bounds: Discrete(n) is the integers from 0 to n - 1."""
 
     path: Path  # Keys and places from the whole value to this array
-    kind: str  # `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary`, or another class
+    kind: str  # `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary`, or another class, as `gym.Box` of the old gym
     shape: tuple[int, ...] = ()
     dtype: str = ""
     low: NDArray[Any] | None = None  # Shape `shape`; None for a kind that cannot be judged
@@ -51,10 +52,20 @@ def find_leaves(space: Any, path: Path = ()) -> list[Leaf]:
         return [leaf for key, value in space.spaces.items() for leaf in find_leaves(value, (*path, key))]
     if isinstance(space, spaces.Tuple):
         return [leaf for i, value in enumerate(space.spaces) for leaf in find_leaves(value, (*path, i))]
-    kind = type(space).__name__
+    kind = _name_kind(space)
     if (bounds := _bounds(space)) is None:
         return [Leaf(path, kind)]
     return [Leaf(path, kind, tuple(space.shape), str(space.dtype), *bounds)]
+
+
+def _name_kind(space: Any) -> str:
+    for known in KNOWN:
+        if isinstance(space, known):  # also a class of the environment's own
+            return known.__name__
+    kind = type(space)
+    if isinstance(space, spaces.Space) or not hasattr(spaces, kind.__name__):
+        return kind.__name__
+    return f"{kind.__module__.partition('.')[0]}.{kind.__name__}"
 
 
 def _bounds(space: spaces.Space[Any]) -> tuple[NDArray[Any], NDArray[Any]] | None:

@@ -159,6 +159,14 @@ class RL104NanObservation(Clean):
         return self.position * np.float32("nan" if self.steps == 11 else 1)
 
 
+class RL104Diverges(Clean):
+    """Its reward follows from the place, which is not finite."""
+
+    def move(self, action):
+        super().move(action)
+        self.position = self.position * np.float32("nan" if self.steps == 11 else 1)
+
+
 class RL105ReusedMemory(Clean):
     def start(self):
         super().start()

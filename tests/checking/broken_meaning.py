@@ -224,6 +224,20 @@ class RL622RoverKeepsAway(Rover):
         return self.distance() - 0.02 * np.square(action).sum()
 
 
+class RL622RoverOfFloat32KeepsAway(RL622RoverKeepsAway):
+    """Its goal is to be in a space of float32, which contains nothing of float64."""
+
+    goals = spaces.Box(-10.0, 10.0, (2,), np.float32)
+
+    def draw_goal(self):
+        return super().draw_goal().astype(np.float32)
+
+    def distance(self):
+        if not self.goals.contains(self.goal):
+            raise TypeError(f"the goal {self.goal} is not in {self.goals}")
+        return super().distance()
+
+
 class RL623RoverComesNearer(Rover):
     """Is paid for the way to the place, and pays for the way back."""
 

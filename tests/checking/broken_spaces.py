@@ -108,3 +108,45 @@ class RL109TextObservation(Clean):
 
     def observe(self):
         return {"position": self.position.copy(), "say": "abc"}
+
+
+class _SpaceOfOldGym:
+    """What the old gym's Box offers; that package is not installed here, and none of its classes is Gymnasium's."""
+
+    def __init__(self, low, high, shape, dtype):
+        self.box = spaces.Box(low, high, shape, dtype)
+        self.low, self.high, self.shape, self.dtype = self.box.low, self.box.high, self.box.shape, self.box.dtype
+
+    def sample(self):
+        return self.box.sample()
+
+    def contains(self, value):
+        return self.box.contains(value)
+
+
+OldBox = type("Box", (_SpaceOfOldGym,), {"__module__": "gym.spaces.box"})
+
+
+class RL008SpacesOfGym(Clean):
+    """`import gymnasium as gym` and, further down, `from gym import spaces`."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_space = OldBox(-self.size, self.size, (2,), np.float32)
+        self.action_space = OldBox(-1.0, 1.0, (2,), np.float32)
+
+
+class RL008ObservationOfGym(Clean):
+    def __init__(self):
+        super().__init__()
+        self.observation_space = OldBox(-self.size, self.size, (2,), np.float32)
+
+
+class OwnBox(spaces.Box):
+    """A box that knows more of its actions, such as their scale."""
+
+
+class RL106OwnBox(Clean):
+    def __init__(self):
+        super().__init__()
+        self.action_space = OwnBox(-1.0, 3.0, (2,), np.float32)

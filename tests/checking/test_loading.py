@@ -29,6 +29,8 @@ CASES = [
     case("broken_loading.py:RL007NoModel", ("RL007", ERROR), pybullet=True),
     case("broken_loading.py:RL007NoModelAtReset", ("RL007", ERROR), pybullet=True),
     case("broken_old_gym.py:RL008Pushed", ("RL008", ERROR)),
+    case("broken_spaces.py:RL008SpacesOfGym", ("RL008", ERROR)),
+    case("broken_spaces.py:RL008ObservationOfGym", ("RL008", ERROR)),
 ]
 
 

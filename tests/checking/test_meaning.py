@@ -10,7 +10,7 @@ import pytest
 from rlctl.checking.rates import find_rates
 from rlctl.checking.rule import NotApplicable, NotJudged
 from rlctl.checking.transitions import Transitions
-from rlctl.checking.values import read_attributes
+from rlctl.checking.values import read_attributes, shape_like
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
 from rlctl.engine import MUJOCO
 from rlctl.environments.spec import EnvSpec
@@ -43,6 +43,7 @@ CASES = [
     broken("RL121ArmMovesItsGoal", ("RL121", "warning"), twin="Arm", file=REACH, slow=True),
     broken("RL622ArmKeepsAway", ("RL622", "warning"), twin="Arm", file=REACH, slow=True),
     broken("RL622RoverKeepsAway", ("RL605", "warning"), ("RL622", "warning"), twin="Rover", slow=True),
+    broken("RL622RoverOfFloat32KeepsAway", ("RL605", "warning"), ("RL622", "warning"), twin="Rover", slow=True),
     broken("RL622PlanarArmKeepsAway", ("RL622", "warning"), twin="PlanarArm", file=REACH, slow=True),
     broken("RL622UprightArmKeepsAway", ("RL622", "warning"), twin="UprightArm", file=REACH, slow=True),
     broken("RL622PosedArmKeepsAway", ("RL622", "warning"), twin="PosedArm", file=REACH, slow=True),
@@ -141,6 +142,13 @@ def test_attributes_of_mixed_shapes_are_read_item_by_item():
     # gym_electric_motor keeps an array of one number next to a number.
     attributes = read_attributes(SimpleNamespace(mixed=[np.zeros(1), 0.5], goal=[0.1, 0.2]))
     assert list(attributes) == ["self.mixed[0]", "self.mixed[1]", "self.goal"]
+
+
+@pytest.mark.parametrize("value", [np.zeros(1, np.float32), np.float32(0), np.zeros((1, 1)), 0.5])
+def test_numbers_take_the_type_of_the_value_that_they_replace(value):
+    replaced = shape_like(value, np.array([0.25]))
+    assert type(replaced) is type(value)
+    assert getattr(replaced, "dtype", None) == getattr(value, "dtype", None)
 
 
 @pytest.mark.slow

@@ -38,6 +38,7 @@ CASES = [
     case("broken_envs.py:RL103Rounding", ("RL103", "warning")),
     case("broken_envs.py:RL103OftenSlightlyOutOfRange", ("RL103", "warning"), slow=True),
     case("broken_envs.py:RL104NanObservation", ("RL104", "error")),
+    case("broken_envs.py:RL104Diverges", ("RL104", "error")),
     case("broken_envs.py:RL105ReusedMemory", ("RL105", "info"), slow=True),
     case("broken_envs.py:RL106UnboundedActions", ("RL106", "error")),
     case("broken_envs.py:RL106WideActions", ("RL106", "info")),
@@ -46,6 +47,7 @@ CASES = [
     case("broken_spaces.py:RL108TwoAxes", ("RL108", "warning"), twin="broken_spaces.py:RL108FloatTable", slow=True),
     case("broken_spaces.py:RL108Dark", ("RL108", "warning"), twin="broken_spaces.py:RL108Seen", slow=True),
     case("broken_spaces.py:RL106Asymmetric", ("RL106", "warning")),
+    case("broken_spaces.py:RL106OwnBox", ("RL106", "warning")),
     case("broken_spaces.py:RL106Thrust", ("RL106", "info")),
     case("broken_spaces.py:RL109TupleObservation", ("RL109", "warning")),
     case("broken_spaces.py:RL109TextObservation", ("RL109", "warning")),
@@ -289,6 +291,11 @@ def test_state_without_effect_is_not_named():
 def test_chance_that_reset_keeps_is_no_missing_seed():
     verdict = verdict_of("broken_repeats.py:KeptChance", "RL308")
     assert verdict.not_judged["RL308"] == "an episode already depends on the previous one (RL301 to RL303)"
+
+
+def test_a_reward_that_follows_a_nan_of_the_observation_is_no_second_error():
+    assert found("broken_envs.py:RL104Diverges", "RL104", "RL601") == {("RL104", "error")}
+    assert found("broken_envs.py:RL104Diverges", "RL601") == {("RL601", "error")}
 
 
 def test_what_a_nearer_rule_explains_is_not_judged():

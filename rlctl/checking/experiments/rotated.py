@@ -26,7 +26,7 @@ from rlctl.checking.values import Attribute, find_unequal, read_attributes
 
 STEPS = 5  # of an episode
 MOST_ANGLES, MOST_TRIED = 24, 80  # attributes that may be angles, and that are tried
-SAME = 1e-6  # of numbers an angle and a whole turn apart, part of their size or of 1
+SAME, SAME_IN_FLOAT32 = 1e-6, 1e-4  # of numbers an angle and a whole turn apart, part of their size or of 1
 USUAL_EPISODES, USUAL_STEPS = 3, 40  # that tell the size of elements
 SEEDS = 6  # that a rule compares
 TIE = 1e-5  # of misfits
@@ -140,15 +140,19 @@ def _read_heading(instance: Instance, heading: TurningPart | HingedBase | None) 
 def _find_angles(instance: Instance, plain: TurnedEpisode) -> list[TurningPart]:
     """Return the numbers that may be a whole turn larger and change nothing then, but matter."""
     found = []
+    states = _read_states(instance)
     places = [
         TurningPart(name if one.numbers.size == 1 else f"{name}[{place}]", ((name, place),), is_heading=True)
-        for name, one in _read_states(instance).items()
+        for name, one in states.items()
         if one.numbers.size <= MOST_ANGLES
         for place in range(one.numbers.size)
     ]
     for part in places[:MOST_TRIED]:
+        is_double = np.asarray(states[part.axes[0][0]].value).dtype.itemsize > np.dtype(np.float32).itemsize
+        same = SAME if is_double else SAME_IN_FLOAT32
         whole = _play(instance, 0, [part], None, FULL_TURN)
-        if _are_same(plain, whole, up_to_turns=True) and not _are_same(plain, _play(instance, 0, [part], None, 1.0)):
+        is_angle = _are_same(plain, whole, same, up_to_turns=True)
+        if is_angle and not _are_same(plain, _play(instance, 0, [part], None, 1.0), same):
             found.append(part)
     return found[:MOST_ANGLES]
 
@@ -165,15 +169,15 @@ def _read_states(instance: Instance) -> dict[str, Attribute]:
     }
 
 
-def _are_same(one: TurnedEpisode, two: TurnedEpisode, *, up_to_turns: bool = False) -> bool:
+def _are_same(one: TurnedEpisode, two: TurnedEpisode, same: float = SAME, *, up_to_turns: bool = False) -> bool:
     if one.observed.shape != two.observed.shape or one.rewards.shape != two.rewards.shape:
         return False
     off = np.abs(one.observed - two.observed)
     if up_to_turns:  # the angle itself may be observed
         off = np.minimum(off, np.abs(off - FULL_TURN))
     size = max(1.0, float(np.abs(one.rewards).max(initial=0.0)))
-    is_same_reward = np.nan_to_num(np.abs(one.rewards - two.rewards)).max(initial=0.0) <= SAME * size
-    return bool((off <= SAME * np.maximum(1.0, np.abs(one.observed))).all() and is_same_reward)
+    is_same_reward = np.nan_to_num(np.abs(one.rewards - two.rewards)).max(initial=0.0) <= same * size
+    return bool((off <= same * np.maximum(1.0, np.abs(one.observed))).all() and is_same_reward)
 
 
 def _choose(

@@ -14,7 +14,8 @@ RULE = Rule(
     Severity.ERROR,
     meaning="""
         The environment is written for the old `gym` package, which is no longer maintained: Gymnasium does not
-        find its registrations, and today's libraries do not accept it.
+        find its registrations, and today's libraries do not accept it. Or its class is Gymnasium's and its spaces
+        are not.
     """,
     fix="""
         Replace `import gym` by `import gymnasium as gym`, register with gymnasium.register, return
@@ -22,6 +23,8 @@ RULE = Rule(
     """,
     needs_instance=False,
 )
+
+SPACES = "Import the spaces from Gymnasium too: `from gymnasium import spaces`."
 
 
 @explains_failures(RULE, place=20)
@@ -36,6 +39,13 @@ def _explain_old_gym(failed: FailedBuild) -> Iterator[RuleFinding]:
 def _find_old_base_class(instance: Instance) -> Iterator[RuleFinding]:
     if inherits_from_old_gym(instance.env):
         yield RuleFinding(RULE, "the class inherits from gym.Env, not from gymnasium.Env")
+        return
+    for name, leaves in (("observation_space", instance.leaves), ("action_space", instance.action_leaves)):
+        kind = next((leaf.kind for leaf in leaves if leaf.kind.startswith("gym.")), None)
+        if kind is not None:
+            message = f"{name} is made of {kind.replace('gym.', 'gym.spaces.')}, which is no space of Gymnasium"
+            yield RuleFinding(RULE, message, {"element": name, "value": kind}, fix=SPACES)
+            return
 
 
 def inherits_from_old_gym(env: Any) -> bool:
