@@ -212,3 +212,26 @@ class GrasperFarAway(RL701Switch):
 class ReturnsNothing(Clean):
     def step(self, action):
         super().step(action)
+
+
+class Trader(OneAxis):
+    """It holds a good, or not, and is paid when it sells; the price is watched. To hold nothing is a choice as well."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(2)
+
+    def start(self):
+        super().start()
+        self.holds = False
+
+    def move(self, action):
+        price = self.position[0]
+        self.paid = 0.0
+        if action != self.holds:
+            self.paid = price - self.bought if self.holds else -0.2
+            self.holds, self.bought = bool(action), price
+        self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+    def reward(self):
+        return float(self.paid)

@@ -276,3 +276,13 @@ class NothingHappensSlowly(NothingHappens):
     def observe(self):
         time.sleep(0.002)
         return super().observe()
+
+
+class RL301StartsElsewhere(Clean):
+    """It draws until it starts in the quarter opposite to where it was: how often, follows from the episode before."""
+
+    def start(self):
+        before = getattr(self, "position", None)
+        super().start()
+        while before is not None and (self.position * before > 0).any():
+            self.position = self.np_random.uniform(-1, 1, 2).astype(np.float32)

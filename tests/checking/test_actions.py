@@ -87,6 +87,11 @@ def test_rewards_that_actions_change_in_a_series_are_worth_knowing():
     assert finding.severity == "info"
 
 
+@pytest.mark.slow
+def test_a_choice_has_no_zero_that_costs_nothing():
+    assert found(f"{FILE}:Trader", "RL701") == {("RL701", "info")}
+
+
 def test_what_is_not_repeatable_is_not_judged():
     verdict = verdict_of("broken_repeats.py:NoisyByItsOwnGenerator", "RL701")
     assert verdict.not_judged["RL701"] == "equal seeds and actions give unequal episodes (RL3)"

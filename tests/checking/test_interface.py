@@ -7,7 +7,7 @@ import pytest
 from rlctl.checking.check import check
 from rlctl.checking.rule_index import RULES
 from rlctl.environments.spec import EnvSpec
-from tests.checking.judging import case, check_case, findings, mark_slow, verdict_of
+from tests.checking.judging import case, check_case, findings, found, mark_slow, verdict_of
 
 FILE = "broken_interface.py"
 CASES = [
@@ -66,6 +66,10 @@ def test_gymnasiums_own_generator_has_no_place():
     (finding,) = findings(f"{FILE}:ForgetsSeed", "RL311")
     assert finding.message.startswith("self._np_random is used")
     assert finding.where is None
+
+
+def test_a_generator_from_which_a_reset_draws_more_or_less_is_seeded():
+    assert found("broken_repeats.py:RL301StartsElsewhere", "RL311") == set()
 
 
 @pytest.mark.slow

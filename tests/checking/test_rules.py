@@ -64,6 +64,7 @@ CASES = [
     case("broken_envs.py:RL207Exits", ("RL207", "error")),
     case("broken_repeats.py:RL301RL309GlobalRandom", ("RL301", "error"), ("RL309", "warning")),
     case("broken_repeats.py:RL302NoisyStep", ("RL302", "error"), ("RL309", "warning")),
+    case("broken_repeats.py:RL301StartsElsewhere", ("RL301", "error")),
     case("broken_repeats.py:RL303LeakyReset", ("RL303", "error")),
     case("broken_repeats.py:RL304ClassCounter", ("RL304", "error"), slow=True),
     *(

@@ -81,7 +81,9 @@ def _find_idle_numbers(shown: ActionTrials) -> Iterator[RuleFinding]:
             effects[dimension.name] = _find_effect(trials, dimension)
             halves |= _find_dead_half(trials, dimension) if effects[dimension.name] == "lasting" else {}
         if "lasting" not in effects.values():
-            costly = [dimension for dimension in every if effects.get(dimension.name) == "reward"]
+            # A choice has no zero: its first value is one like the others.
+            amounts = [dimension for dimension in every if "float" in dimension.leaf.dtype]
+            costly = [dimension for dimension in amounts if effects.get(dimension.name) == "reward"]
             effects |= {dimension.name: "cost" for dimension in costly if _only_costs(trials, dimension)}
     except OutOfTime:
         why = "time ran out"
