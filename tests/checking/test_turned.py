@@ -1,5 +1,8 @@
 """RL123, RL124, RL618: robots with a free base whose heading matters."""
 
+import subprocess
+import sys
+
 import pytest
 
 from tests.checking.judging import case, check_case, findings, found, mark_slow, verdict_of
@@ -69,3 +72,16 @@ def test_bumps_are_no_level_ground():
 def test_a_robot_that_a_later_reset_puts_beside_a_wall_is_not_judged():
     verdict = verdict_of("broken_turned.py:PuckBesideAWall", "RL123")
     assert verdict.not_judged["RL123"] == "not each reset puts the robot on level ground"
+
+
+@pytest.mark.slow
+@pytest.mark.pybullet
+def test_pybullet_is_not_asked_for_shapes_that_it_dies_of():
+    lines = [
+        "import pybullet, pybullet_data",
+        "from rlctl.checking.experiments.turned import _find_free_bodies",
+        "client = pybullet.connect(pybullet.DIRECT)",
+        "pybullet.loadMJCF(pybullet_data.getDataPath() + '/mjcf/reacher.xml', physicsClientId=client)",
+        "assert _find_free_bodies([client]) == []",
+    ]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], check=True, timeout=120)
