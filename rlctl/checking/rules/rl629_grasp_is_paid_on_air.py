@@ -1,6 +1,6 @@
 """RL629: grasp is paid on air."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ RULE = Rule(
 SEEDS, MOST_SEEDS = 5, 12
 ARM_STEPS, HOLD_STEPS = 6, 14  # with a random action; with the gripper closed or open
 MUCH = 0.2  # part of the largest term that closing has to earn
-SAME = 0.25  # relative difference of what it earns in different episodes
+SAME, SAME_REWARD = 0.25, 0.5  # relative differences of what it earns in different episodes, of the term and in all
 MOVED = 0.01  # of an object [m]
 MOST_DIMENSIONS = 9
 
@@ -75,35 +75,47 @@ def _measure_gains(instance: Instance, dimension: ActionNumber, name: str) -> li
     """Return what one end of an element of the action earns more than the other, in several episodes in which no object
     was moved; None where it is not about the same in all, or there are too few."""
     gains: list[float] = []
+    rewards: list[float] = []  # what it earns more in all
     for seed in range(FIRST_SEED, FIRST_SEED + MOST_SEEDS):
         ends = [_play(instance, seed, dimension, end, name) for end in dimension.ends]
         if any(end is None for end in ends):
             continue
-        low, high = (float(end or 0.0) for end in ends)
+        (low, low_reward), (high, high_reward) = (end or (0.0, 0.0) for end in ends)
         gains.append(high - low)
+        rewards.append(high_reward - low_reward)
         if max(low, high) <= 0 or abs(gains[-1]) <= MUCH * max(abs(low), abs(high)):
             return None
         if len(gains) == SEEDS:
             break
+    if len(gains) < SEEDS or not _are_alike(gains, SAME):
+        return None
+    # A number in info may be a factor of the reward, which is paid at the object only.
+    is_paid = _are_alike(rewards, SAME_REWARD) and rewards[0] * gains[0] > 0
+    return np.abs(gains).tolist() if is_paid else None
+
+
+def _are_alike(gains: Sequence[float], most: float) -> bool:
     sizes = np.abs(gains)
-    is_same = len(gains) == SEEDS and len({gain > 0 for gain in gains}) == 1 and np.ptp(sizes) <= SAME * sizes.max()
-    return sizes.tolist() if is_same else None
+    return len({gain > 0 for gain in gains}) == 1 and bool(np.ptp(sizes) <= most * sizes.max())
 
 
-def _play(instance: Instance, seed: int, dimension: ActionNumber, value: float, name: str) -> float | None:
-    """Return what the term pays at the end; None where the episode ends before, or an object was moved."""
+def _play(
+    instance: Instance, seed: int, dimension: ActionNumber, value: float, name: str
+) -> tuple[float, float] | None:
+    """Return what the term and the whole reward pay at the end; None where the episode ends before, or an object was
+    moved."""
     trials = Trials(instance)
     sequence = _list_actions(trials, seed, dimension, value)
-    paid = None
+    paid, reward = None, 0.0
     before: dict[str, Numbers] = {}
     for moment in EpisodePlayer(instance, seed, sequence=sequence, max_steps=len(sequence)):
         if moment.step == ARM_STEPS:
             before = _read_objects(instance)
         if moment.step == len(sequence):
-            paid = dict(find_numbers(moment.info)).get(name)
+            paid, reward = dict(find_numbers(moment.info)).get(name), moment.reward_number
     after = _read_objects(instance)
     is_moved = any(np.abs(after[body] - place).max() > MOVED for body, place in before.items() if body in after)
-    return None if is_moved else paid
+    return None if is_moved or paid is None else (float(paid), reward)
 
 
 def _read_objects(instance: Instance) -> dict[str, Numbers]:
