@@ -197,7 +197,9 @@ def _rank(one: Expression) -> int:
     """Return 0 for what is stored, 1 for what is read, and 2 for what may be the inverse of an orientation."""
     parameters = set(list_parameters(one.function))
     names = {node.id for node in ast.walk(one.node) if isinstance(node, ast.Name)}
-    if names & parameters or list_words(one.node) & INVERSE_WORDS or isinstance(one.node, ast.BinOp | ast.UnaryOp):
+    is_turned = any(isinstance(node, ast.Attribute) and node.attr == "T" for node in ast.walk(one.node))
+    is_computed = isinstance(one.node, ast.BinOp | ast.UnaryOp)
+    if names & parameters or list_words(one.node) & INVERSE_WORDS or is_turned or is_computed:
         return 2
     return 0 if isinstance(one.node, ast.Attribute | ast.Subscript) and "self" in names else 1
 

@@ -97,6 +97,8 @@ class BoatLooksAside(Boat):
 
 
 class RL126BoatLooksAsideInDegrees(BoatLooksAside):
+    rlctl_ignore = {"RL114": "what it observes of its lamp is not the angle that it is paid for"}
+
     def reward(self):
         x, y = self.buoy - self.place
         c, s = math.cos(self.lamp_deg), math.sin(self.lamp_deg)
@@ -132,6 +134,8 @@ class BoatHeels(Boat):
 
 
 class RL132BoatHeelsAnyhow(BoatHeels):
+    rlctl_ignore = {"RL204": "a numpy.bool works everywhere"}
+
     def is_upright(self):
         return abs(self.heel) < MOST_HEEL
 

@@ -102,6 +102,12 @@ class Probe(Free):
 
 
 class RL124ProbeBeacon(Probe):
+    rlctl_ignore = {
+        **Probe.rlctl_ignore,
+        "RL125": "the same elements once more",
+        "RL701": "its motor pushes in one direction",
+    }
+
     def seen(self):
         return self.turn().apply(self.beacon)
 

@@ -8,6 +8,7 @@ from robots import Crawler
 class Follower:
     """What both share: a speed that is drawn every few steps, the order of a step, and a time limit."""
 
+    rlctl_ignore = dict.fromkeys(["RL110", "RL506", "RL604"], "it falls early, and is paid badly")
     limit = 150  # [steps]
     every = 20  # [steps]
     wanted = 0.0

@@ -229,6 +229,8 @@ class RL622PosedArmKeepsAway(PosedArm):
 
 
 class RL619UprightArmFarGoals(UprightArm):
+    rlctl_ignore = {"RL611": "a consequence"}
+
     def draw_goal(self):
         goal = super().draw_goal()
         return goal + 0.6 * (goal - np.array([0.0, 0.0, 0.1]))

@@ -134,6 +134,8 @@ class Boat(gym.Env):
 
 
 class RL634BoatFleesTheCommand(Boat):
+    rlctl_ignore = {**Boat.rlctl_ignore, "RL622": "the same sum once more"}
+
     def terms(self):
         return {**super().terms(), "turn": 0.5 * (self.command[1] - self.rate) ** 2}
 

@@ -70,6 +70,8 @@ class FlyerSeesWorldAndDirection(RL123FlyerSeesWorld):
 
 
 class RL124FlyerTurnsBack(FlyerSeesSpeed):
+    rlctl_ignore = {**Flyer.rlctl_ignore, "RL129": "the same line once more"}
+
     def speed(self):
         x, y, z = self.data.qvel[:3]
         cosine, sine = np.cos(self.yaw()), np.sin(self.yaw())
@@ -138,6 +140,8 @@ class RL124PuckTurnsBack(PuckSeesSpeed):
 
 class Base(gymnasium.Env):
     """A base on three wheels, without an engine, keeps a velocity that is drawn, in its own frame."""
+
+    rlctl_ignore = {"RL609": "it follows a velocity without end"}
 
     dt, limit = 0.05, 60
 

@@ -36,6 +36,7 @@ RULE = Rule(
 
 MOSTLY = 0.6  # part of these that have to show an element
 CONFIRMED = 3  # episodes with other seeds, at least
+TURNED = ("RL124", "RL125")  # A vector in no frame of the robot hides the heading, too
 VARIED = 0.5  # how far headings at the start are apart [rad]
 SAME = 0.02  # part of the size of a cosine by which its size may change
 TURN_ERROR = 0.1  # part of the length of a vector
@@ -71,7 +72,7 @@ def _find_world_vectors(robot: RotatedRobot) -> Iterator[RuleFinding]:
             f"{listed} are in the axes of the world, and nothing of the observation shows the heading of the robot,"
         )
         message += f" {robot.heading_name}: with its world turned about the vertical it observes the same otherwise"
-        yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, severity)
+        yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, severity, same=TURNED)
     if turns.any():
         return
     rewards = [np.array([episode.rewards for episode in turning.common]) for turning in turnings]
@@ -83,7 +84,8 @@ def _find_world_vectors(robot: RotatedRobot) -> Iterator[RuleFinding]:
             f"with its world turned about the vertical, the robot observes the same and gets rewards from {low:.4g}"
         )
         message += f" to {high:.4g}: nothing of the observation shows its heading {robot.heading_name}"
-        yield RuleFinding(RULE, message, {"seed": FIRST_SEED, "value": high - low, "expected": 0.0}, severity)
+        evidence = {"seed": FIRST_SEED, "value": high - low, "expected": 0.0}
+        yield RuleFinding(RULE, message, evidence, severity, same=TURNED)
 
 
 def _describe_doubles(robot: RotatedRobot, turnings: Sequence[Turning]) -> Iterator[RuleFinding]:
@@ -93,7 +95,7 @@ def _describe_doubles(robot: RotatedRobot, turnings: Sequence[Turning]) -> Itera
         turn, are = ("turn", "they are") if len(columns) > 1 else ("turns", "it is")
         message = f"{list_names([names[column] for column in columns])} {turn} twice as far as the world does: {are}"
         message += f" turned by the heading of the robot, {robot.heading_name}, in the wrong direction"
-        yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, same=("RL124", "RL125"))
+        yield RuleFinding(RULE, message, {"element": names[columns[0]], "seed": FIRST_SEED}, same=TURNED)
 
 
 def _are_varied(turnings: Sequence[Turning]) -> bool:

@@ -42,9 +42,12 @@ def find_time_limit_as_terminated(records: Records) -> Iterator[RuleFinding]:
         yield RuleFinding(RULE, message, flags, where=built.counter_place)
         return
     longest = max(episode.steps for episode in [*episodes, *records.role("search")])
-    if found := list(_judge_held(records.facts.get("held", []), longest)):
+    held = records.facts.get("held", [])
+    if found := list(_judge_held(held, longest)):
         yield from found
         return
+    if any(len(episode.rewards) > limit for episode in held):
+        return  # what ends the others is a fall
     records.require_whole("episodes", "search")
     longer = [episode for episode in episodes if episode.ended not in ENDS] + records.role("search")
     if any(episode.steps > limit for episode in longer):
@@ -71,10 +74,11 @@ def _ends_with_odd_reward(episode: CheckedEpisode) -> bool:
 
 
 def _judge_held(held: Sequence[HeldEpisode], longest: int) -> Iterator[RuleFinding]:
-    """Judge episodes that only time can end; the longest of the others ended before."""
+    """Judge episodes that only time can end; none of the others went on for longer."""
     limits = {len(episode.rewards) for episode in held}
     limit = max(limits, default=0)
-    if len(limits) > 1 or limit <= max(longest, SHORTEST_TIE) or {episode.ended for episode in held} != {"terminated"}:
+    is_limit = len(limits) == 1 and limit > SHORTEST_TIE and limit >= longest
+    if not is_limit or {episode.ended for episode in held} != {"terminated"}:
         return
     is_carried = any(episode.moves for episode in held)
     kept = "put back to its start, or carried along," if is_carried else "put back to its start"

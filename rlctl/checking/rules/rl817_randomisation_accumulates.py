@@ -11,6 +11,7 @@ from rlctl.checking.experiments.expressions import NotedEpisodes, judges_express
 from rlctl.checking.experiments.worlds import judges_resets
 from rlctl.checking.goal_draws import is_drawn
 from rlctl.checking.instance import Instance
+from rlctl.checking.left_overs import STATE_FIELDS
 from rlctl.checking.records import FIRST_SEED, SECOND_SEED
 from rlctl.checking.rule import Rule, RuleFinding, Severity
 from rlctl.checking.source_code import write_code
@@ -53,7 +54,8 @@ def _judge_source(noted: NotedEpisodes) -> Iterator[RuleFinding]:
         of_episodes = [one for one in assignments if one.function in {*noted.of_resets, *noted.of_steps}]
         owners = [other for other in assigned if key.startswith(f"{other}.")]
         is_rebuilt = any(one.function in noted.of_resets for owner in owners for one in assigned[owner])
-        if len(of_episodes) == 1 and not is_rebuilt and not read_words(key) & LASTING_WORDS:
+        is_state = key.rpartition(".")[2] in STATE_FIELDS  # of MuJoCo, which mj_resetData sets back: else RL303
+        if len(of_episodes) == 1 and not is_rebuilt and not is_state and not read_words(key) & LASTING_WORDS:
             (one,) = of_episodes
             if one.function in noted.of_resets and one.function.name != "__init__" and _grows(noted, one, key):
                 message = f"{write_code(one.statement)}: each reset changes {key} as the last one has left it"
