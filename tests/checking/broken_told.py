@@ -62,6 +62,8 @@ class RL621ArmPaidForTime(ArmTells):
 
 
 class RL621ReacherPaidForTime(ReacherTells):
+    rlctl_ignore = {**Reacher.rlctl_ignore, "RL611": "chance does not get there"}
+
     time = 0.02
 
 
