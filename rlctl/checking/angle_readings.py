@@ -266,7 +266,7 @@ class AngleReadings:
         """What modules and classes set outside their functions, by its name."""
         found: dict[str, list[tuple[ast.expr, int | None]]] = {}
         for tree in self.source.trees.values():
-            classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+            classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and not self._is_other(node)]
             for body in [tree.body, *(owner.body for owner in classes)]:
                 for statement in body:
                     match statement:
@@ -279,6 +279,11 @@ class AngleReadings:
                         ):
                             found.setdefault(read_name(target), []).append((value, None))
         return found
+
+    def _is_other(self, owner: ast.ClassDef) -> bool:
+        """Say whether a class is another environment that inherits from the same."""
+        own = self.source.classes
+        return owner.name not in own and any(read_name(base) in own for base in owner.bases)
 
     @functools.cached_property
     def _lines(self) -> dict[str, list[str]]:

@@ -194,6 +194,7 @@ class RL810HopperStartsInDegrees(MujocoHopper):
         "RL603": "a consequence",
         "RL804": "a consequence",
         "RL803": "a consequence",
+        "RL124": "a consequence",
     }
 
     def start(self):

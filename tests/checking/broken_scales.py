@@ -63,6 +63,8 @@ class RL706PusherOnePercent(Pusher):
 
 
 class RL625RL706ReacherOnePercent(Reacher):
+    rlctl_ignore = {**Reacher.rlctl_ignore, "RL611": "chance does not get there"}
+
     def target(self, action):
         return super().target(0.01 * action)
 
@@ -71,6 +73,8 @@ class RL625RL706ReacherOnePercent(Reacher):
 
 
 class RL624ArmTolerance(MujocoArm):
+    rlctl_ignore = {"RL611": "a consequence", "RL619": "with the tolerance that is meant it is within reach"}
+
     def succeeds(self):
         return 100 * self.distance() < 0.05
 

@@ -120,6 +120,8 @@ class CrawlerLooks(AnyHeading, Crawler):
 
 
 class RL123CrawlerNorth(CrawlerLooks):
+    rlctl_ignore = {**CrawlerLooks.rlctl_ignore, "RL110": "it does not turn so far"}
+
     def angles(self):
         return [*super().angles()[:2], 0.0]
 

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rlctl.checking.rates import find_rates
+from rlctl.checking.rates import Rate, find_rates
 from rlctl.checking.rule import NotApplicable, NotJudged
+from rlctl.checking.rules.rl119_mixed_units import _are_mixed_up
 from rlctl.checking.transitions import Transitions
 from rlctl.checking.values import read_attributes, shape_like
 from rlctl.checking.workspaces import find_chains, find_reach, measure_reach
@@ -203,3 +204,10 @@ def test_edge_of_a_workspace_is_found_and_a_path_has_none():
     walk = np.cumsum(rng.normal(size=(20, 100, 2)), axis=1).reshape(-1, 2)
     with pytest.raises(NotApplicable):
         find_reach(walk, episodes)
+
+
+def test_a_speed_that_is_a_part_of_the_other_place_fits_by_chance():
+    joint = Rate("observation[16]", "observation[35]", 0.1, 3.0)
+    length = Rate("length of (observation[34] to observation[35])", "|observation[17]|", 0.001, 9.0)
+    assert _are_mixed_up(joint, length)
+    assert not _are_mixed_up(joint, Rate("observation[35]", "observation[3]", 0.001, 9.0))  # place, speed, acceleration

@@ -85,13 +85,19 @@ def _find_mixed_units(records: Records) -> Iterator[RuleFinding]:
         for long in pairs:
             for unit in UNITS:
                 is_factor = abs(long.seconds / short.seconds / unit.factor - 1) < unit.tolerance
-                if is_factor and long.size >= unit.least_size:
+                if is_factor and long.size >= unit.least_size and not _are_mixed_up(short, long):
                     other = f"{short.quantity} by {short.seconds:.4g} times {short.rate}, {unit.factor:.4g} times less"
                     yield _finding(long, f"{other}: {unit.small} and {unit.large}")
                     return
     longest = pairs[-1]
     if (built.uses_pybullet or built.model) and longest.seconds > LONGEST_STEP and longest.size > LARGE:
         yield _finding(longest, f"a step of the simulation would take {longest.seconds:.3g} s: millimetres and metres")
+
+
+def _are_mixed_up(one: Rate, other: Rate) -> bool:
+    """Say whether the speed of one is a part of the place of the other: they fit by chance."""
+    pairs = ((one.rate.strip("|"), other.quantity), (other.rate.strip("|"), one.quantity))
+    return any(rate in quantity and rate != quantity for rate, quantity in pairs)
 
 
 @dataclasses.dataclass(frozen=True)
