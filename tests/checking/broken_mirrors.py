@@ -18,6 +18,8 @@ class RL120TurnsHipsTheSameWay(Walk):
 
 
 class RL120PrefersItsLeft(Walk):
+    rlctl_ignore = {**Walk.rlctl_ignore, "RL632": "it follows its yaw rate only"}
+
     def rewards(self, action):
         return {**super().rewards(action), "tracking": 10.0 * self.turning[:, 2]}
 

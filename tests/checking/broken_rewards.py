@@ -240,6 +240,8 @@ class RL621LowersTheReward(Terms):
 class RL606AliveBonus(Terms):
     """A bonus per step beside a term for speed that can hardly be had, and a cost of moving."""
 
+    rlctl_ignore = {"RL621": "it is paid for moving, by so little"}
+
     def terms(self):
         return {"alive": 1.0, "speed": 0.02 * float(np.abs(self.action).sum()), "effort": 5 * self.effort()}
 

@@ -89,6 +89,8 @@ class RL624RoverTolerance(Rover):
 
 
 class RL624DroneTolerance(Drone):
+    rlctl_ignore = {"RL611": "a consequence"}
+
     near = 0.0015
 
 
