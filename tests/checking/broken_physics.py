@@ -91,6 +91,8 @@ class FixedCart(Cart):
 
 
 class RL801NoGravity(Cart):
+    rlctl_ignore = {**Cart.rlctl_ignore, "RL123": "a consequence"}
+
     def vary(self):
         p.setGravity(0, 0, 0, physicsClientId=self.client)
 
