@@ -1,5 +1,6 @@
 """The table of all that play: what each is called, what it stands for, and how it plays where it applies."""
 
+import contextlib
 import dataclasses
 import enum
 import functools
@@ -60,7 +61,10 @@ class Plays:
     def seeds(self) -> Sequence[int]:
         """The seeds of the rounds."""
         count = len(COMMANDED)
-        return range(FIRST_SEED, FIRST_SEED + count) if self.lead is None else self.lead.list_seeds(count)
+        with contextlib.suppress(EnvironmentRaised, NotJudged):  # as above; an episode without a goal
+            if self.lead is not None:
+                return self.lead.list_seeds(count)
+        return range(FIRST_SEED, FIRST_SEED + count)
 
     def stance(self, seed: int, number: int) -> walking.SettledPose:
         """Return how the robot with a free base stands in the episode of a seed."""
@@ -309,7 +313,7 @@ def _bring_goal(plays: Plays, seed: int, number: int) -> Script | None:
 
 def _stand_as_commanded(plays: Plays, seed: int, number: int) -> Script | None:
     lead = plays.lead
-    return None if lead is None or lead.source else lead.prepare(plays.still(), seed, plays.world.longest)
+    return None if lead is None or lead.source is not None else lead.prepare(plays.still(), seed, plays.world.longest)
 
 
 def _hover(plays: Plays, seed: int, number: int) -> Script | None:

@@ -10,6 +10,7 @@ from rlctl.checking.drawn_goals import TURNED
 from rlctl.checking.instance import Budget, Context
 from rlctl.checking.progress import read_clock
 from rlctl.checking.records import FIRST_SEED, Fact
+from rlctl.checking.rule import NotJudged
 from rlctl.environments.spec import EnvSpec
 from tests.checking.judging import FOLDER
 
@@ -52,6 +53,15 @@ def test_goals_are_played_that_are_far_away():
     away = {seed: np.linalg.norm(goals[seed]) for seed in range(FIRST_SEED, FIRST_SEED + 12)}  # from where it begins
     assert {*plays.seeds} == {*sorted(away, key=away.get)[-4:]}
     context.instance.close()
+
+
+def test_where_some_episodes_have_no_goal_others_play(monkeypatch):
+    def list_seeds(lead, count):
+        raise NotJudged("not every episode has the goal")
+
+    monkeypatch.setattr(leading.Lead, "list_seeds", list_seeds)
+    episodes, _ = play("broken_paid.py:Docker", STILL)
+    assert episodes[STILL].seed == FIRST_SEED
 
 
 def test_who_waits_beside_the_goal_earns_more_than_one_who_is_there():
