@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rlctl.checking.audit.play_world import Script
-from rlctl.checking.audit.reaching import BEYOND, BISECTIONS, LONGEST_WAY
+from rlctl.checking.audit.reaching import LONGEST_WAY, find_beside
 from rlctl.checking.drawn_goals import TURNED, DrawnGoal, Numbers, Source
 from rlctl.checking.experiments.commands import is_velocity, list_commands
 from rlctl.checking.experiments.goals import find_drawn_goal, find_places
@@ -46,7 +46,7 @@ class Lead:
         return Script(actor, coming.start, before=coming.move)
 
     def find_hover(self, seed: int) -> float | None:
-        """Return the part of the way at which a goal is no success yet, by bisection; None if it always is one."""
+        """Return the part of the way at which a goal is no success yet; None if it always is one."""
         source = self.source
         there = None if source is None else self.trials.find_place(source, seed, "zero")
         if source is None or there is None:
@@ -56,13 +56,7 @@ class Lead:
         def succeeds(part: float) -> bool:
             return bool(self.trials.succeeds(seed, there + part * way, source if source[1] else None, "zero"))
 
-        near, far = 0.0, 1.0
-        if succeeds(far):
-            return None
-        for _ in range(BISECTIONS):
-            middle = (near + far) / 2
-            near, far = (middle, far) if succeeds(middle) else (near, middle)
-        return min(1.0, BEYOND * far)
+        return find_beside(succeeds)
 
     def _trace(self, seed: int, longest: int) -> list[Numbers]:
         """Return where the robot is after each step in which it does nothing."""

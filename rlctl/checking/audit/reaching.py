@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,17 +210,21 @@ def is_success(world: PlayWorld, way: Way, part: float, seed: int, number: int) 
 
 
 def find_hover(world: PlayWorld, way: Way, seed: int, number: int) -> Array | None:
-    """Return a state beside the goal that is no success, by bisection; None if already the start is one."""
-    if is_success(world, way, 1.0, seed, number):
+    """Return a state beside the goal that is no success; None if already the start is one."""
+    part = find_beside(lambda part: is_success(world, way, part, seed, number))
+    return None if part is None else way.at(part)
+
+
+def find_beside(succeeds: Callable[[float], bool]) -> float | None:
+    """Return the part of the way from the goal (0) to the start (1) that is just no success, by bisection; None if
+    already the start is one."""
+    if succeeds(1.0):
         return None
     near, far = 0.0, 1.0
     for _ in range(BISECTIONS):
         middle = (near + far) / 2
-        if is_success(world, way, middle, seed, number):
-            near = middle
-        else:
-            far = middle
-    return way.at(min(1.0, BEYOND * far))
+        near, far = (middle, far) if succeeds(middle) else (near, middle)
+    return min(1.0, BEYOND * far)
 
 
 class Moved:

@@ -46,10 +46,12 @@ def find_unseeded(context: Context) -> Iterator[ChildMessage]:
     instance.reset(FIRST_SEED)
     after = read_generators(instance.env)
     moved = [name for name, state in after.items() if (context.generators or {}).get(name, state) != state]
-    for name in [name for name in moved if not _is_restored(instance, name)][:1]:
-        message = f"{name} is used, and reset(seed={FIRST_SEED}) does not restore its state"
-        where = find_assignment(instance.env, name)
-        yield RuleFinding(RULE, message, {"element": name, "seed": FIRST_SEED}, where=where)
+    for name in moved:
+        if not _is_restored(instance, name):
+            message = f"{name} is used, and reset(seed={FIRST_SEED}) does not restore its state"
+            where = find_assignment(instance.env, name)
+            yield RuleFinding(RULE, message, {"element": name, "seed": FIRST_SEED}, where=where)
+            return
 
 
 def _is_restored(instance: Instance, name: str) -> bool:
